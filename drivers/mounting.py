@@ -55,9 +55,9 @@ class BodyFrame:
             self._attitude = sample
         elif isinstance(sample, AngularRate):
             self._rate = sample
-        return self._moved(sample, mounting.arm_b) if any(mounting.arm_b) else sample
+        return self._move(sample, mounting.arm_b) if any(mounting.arm_b) else sample
 
-    def _moved(self, sample: TelemetrySample, arm_b: Vector) -> TelemetrySample:
+    def _move(self, sample: TelemetrySample, arm_b: Vector) -> TelemetrySample:
         if isinstance(sample, Velocity):
             if self._rate is None or _stale(self._rate, sample):
                 return sample

@@ -45,11 +45,11 @@ class Packetizer:
         payloads = [*aggregated, *_fragments(units[-1])]
         ticks = t_ns * CLOCK_HZ // 1_000_000_000 & 0xFFFFFFFF
         return [
-            self._headed(payload, ticks, position == len(payloads) - 1)
+            self._add_header(payload, ticks, position == len(payloads) - 1)
             for position, payload in enumerate(payloads)
         ]
 
-    def _headed(self, payload: bytes, ticks: int, last: bool) -> bytes:
+    def _add_header(self, payload: bytes, ticks: int, last: bool) -> bytes:
         kind = last << 7 | self.payload_type
         head = struct.pack(">BBHII", 0x80, kind, self._number & 0xFFFF, ticks, self._source)
         self._number += 1

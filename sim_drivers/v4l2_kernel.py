@@ -109,7 +109,7 @@ class V4l2Kernel:
             self._owner, self._buffers = None, Buffers()
 
     def wait(self, fd: int, timeout_s: float) -> bool:
-        if self._gone(fd):
+        if self._is_gone(fd):
             return True
         return self.feed.wait(timeout_s)
 
@@ -120,7 +120,7 @@ class V4l2Kernel:
         if self.spec.interrupts > 0:
             self.spec.interrupts -= 1
             raise InterruptedError(errno.EINTR, os.strerror(errno.EINTR))
-        if self._gone(fd):
+        if self._is_gone(fd):
             raise refusal(errno.ENODEV)
         data = memoryview(argument).cast("B")
         assert len(data) == request >> 16 & 0x3FFF
@@ -230,19 +230,19 @@ class V4l2Kernel:
 
     def _get_control(self, fd: int, data: memoryview) -> None:
         (control,) = struct.unpack_from("I", data)
-        struct.pack_into("i", data, 4, self._known(control))
+        struct.pack_into("i", data, 4, self._control_value(control))
 
     def _set_control(self, fd: int, data: memoryview) -> None:
         control, value = struct.unpack_from("Ii", data)
-        self._known(control)
+        self._control_value(control)
         self.controls[control] = value
 
     def _query_control(self, fd: int, data: memoryview) -> None:
         (control,) = struct.unpack_from("I", data)
-        self._known(control)
+        self._control_value(control)
         struct.pack_into("iiii", data, 40, 1, 10_000, 1, 5000)
 
-    def _known(self, control: int) -> int:
+    def _control_value(self, control: int) -> int:
         if control not in self.controls:
             raise refusal(errno.EINVAL)
         return self.controls[control]
@@ -251,7 +251,7 @@ class V4l2Kernel:
         height, width = self.feed.peek().image.shape[:2]
         return width, height
 
-    def _gone(self, fd: int) -> bool:
+    def _is_gone(self, fd: int) -> bool:
         return not self._present or self._descriptors[fd] not in self._nodes()
 
     def _nodes(self) -> tuple[str, str]:

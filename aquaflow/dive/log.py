@@ -45,7 +45,7 @@ class EarlyRecords(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         self._records.append(record)
 
-    def taken(self) -> list[logging.LogRecord]:
+    def take(self) -> list[logging.LogRecord]:
         """End, and the records."""
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level_before)
@@ -86,7 +86,7 @@ class JsonLog(logging.Handler):
 
     def attach(self) -> None:
         """Receive what AquaFlow logs from here on, until closed, and what was kept for it."""
-        early = [record for each in _early() for record in each.taken()]
+        early = [record for each in _early() for record in each.take()]
         for name in LOGGERS:
             logger = logging.getLogger(name)
             self._levels_before[name] = logger.level
@@ -120,7 +120,7 @@ class JsonLog(logging.Handler):
             logger.setLevel(level)
         self.acquire()
         try:
-            for entry in self._repeats.held():
+            for entry in self._repeats.held_entries():
                 self._write(entry)
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -186,7 +186,7 @@ class Repeats:
         left_out, met.written_s, met.left_out = met.left_out, now_s, 0
         return _count(entry, left_out)
 
-    def held(self) -> list[Entry]:
+    def held_entries(self) -> list[Entry]:
         """The newest of each kind that was not written, for the end of the log."""
         waiting = [met for met in self._met.values() if met.left_out]
         self._met.clear()

@@ -205,7 +205,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
 def turns_of(results: Sequence[Tracked]) -> Turns:
     """How the camera turned, within every sub-map."""
     posed = [each for each in results if each.T_wc is not None]
-    return Turns.joined(
+    return Turns.join(
         [
             _turns_of_sub_map([each for each in posed if each.sub_map == sub_map])
             for sub_map in sorted({each.sub_map for each in posed})

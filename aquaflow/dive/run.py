@@ -125,7 +125,7 @@ class DiveRun:
         """Process a frame; the frames that it finished; a picture that cannot be prepared costs
         itself, not the dive."""
         begun = time.monotonic()
-        prepared = self._prepared(frame)
+        prepared = self._prepare(frame)
         if prepared is None:
             return []
         self._keep(prepared)
@@ -148,7 +148,7 @@ class DiveRun:
                 with self.slam.failures.contain("keeping of telemetry"):
                     self.telemetry_log.add(samples)
 
-    def _prepared(self, frame: Frame) -> Frame | None:
+    def _prepare(self, frame: Frame) -> Frame | None:
         """None for a picture that cannot be prepared, which is dropped."""
         reason = "preparation failed, see log.jsonl"
         with self.slam.stages("prepare", frame.index):

@@ -78,7 +78,7 @@ def rays_to_points(
     along = points @ axis
     aside = points - along[..., None] * axis
     radius = np.linalg.norm(aside, axis=-1)
-    flat = port.aligned()
+    flat = port.align()
     last = STEEPEST_RAD if isinstance(port, FlatPort) else np.pi
     seen = np.isfinite(radius + along) & (
         _miss(np.full_like(radius, last), radius, along, flat) < 0

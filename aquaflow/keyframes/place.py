@@ -44,7 +44,7 @@ class KeypointDepths:
     variance: Array
     """[M] variance of ``rho``."""
 
-    def known(
+    def is_known(
         self,
         relative_sigma: float,
     ) -> npt.NDArray[np.bool_]:

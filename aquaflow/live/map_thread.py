@@ -112,7 +112,7 @@ class MapThread:
     # --- what tracking asks for -----------------------------------------------------------------
 
     def grow(self, growth: Growth) -> None:
-        refused = self._refused(growth)
+        refused = self._refuse_growth(growth)
         if refused is not None:
             self.left_out[refused] += 1
             return
@@ -189,7 +189,7 @@ class MapThread:
 
     # --- the thread -----------------------------------------------------------------------------
 
-    def _refused(self, growth: Growth) -> str | None:
+    def _refuse_growth(self, growth: Growth) -> str | None:
         if self._level() >= DegradationLevel.TRACKING_ONLY:
             return "tracking only"
         backlog, waiting = self._config.backlog, self._growing

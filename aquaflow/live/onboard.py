@@ -114,7 +114,7 @@ class Onboard:
                 continue
             self._reason = IDLE
             finished = self._dive(asked, automatic)
-            control.ended()
+            control.end_dive()
             if not self._feed.lasting:
                 break
             self._feed.forget()
@@ -153,11 +153,11 @@ class Onboard:
             station.show(dive)
             try:
                 dive.map()
-                return self._finished(dive)
+                return self._finish_dive(dive)
             finally:
                 station.hide()
 
-    def _finished(self, dive: LiveDive) -> Finished | None:
+    def _finish_dive(self, dive: LiveDive) -> Finished | None:
         """The end of a dive in a thread of its own, while the service goes on to answer."""
         control = self._control
         with ThreadPoolExecutor(1, "finishing") as threads:

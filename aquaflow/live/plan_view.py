@@ -53,11 +53,11 @@ class PlanView:
         """
         with self._lock:
             if self._now_s() - self._computed_s >= KEPT_S:
-                self._said = self._computed()
+                self._said = self._compute()
                 self._computed_s = self._now_s()
             return self._said
 
-    def _computed(self) -> dict[str, Any]:
+    def _compute(self) -> dict[str, Any]:
         parts = self._parts()
         if parts is None:
             return {"sub_maps": [], "now": None}

@@ -62,7 +62,7 @@ class WaterFitting:
             run_to_end(self._fitting(views))
         self._end(views)
 
-    def moved(self, moves: Mapping[int, Sim3]) -> None:
+    def follow_moves(self, moves: Mapping[int, Sim3]) -> None:
         """Keyframes have moved: a fit under way begins again if the map's unit did."""
         if any(abs(move.scale - 1.0) > OTHER_UNIT for move in moves.values()):
             self.begin_again()

@@ -126,7 +126,7 @@ def _copy(network: Path, folder: Path) -> dict[str, str]:
 
 def _try_prior(folder: Path, card: PriorCard) -> Described:
     describer = DepthDescriber(folder, CPU)
-    picture = describer.fitted(example_picture(card.height, card.width))
+    picture = describer.fit(example_picture(card.height, card.width))
     height, width = picture.shape[:2]
     before = time.perf_counter()
     try:

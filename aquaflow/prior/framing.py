@@ -47,7 +47,7 @@ class ImagePadding:
         ]
         return ImagePadding(*frame, *before, *inner)
 
-    def framed(
+    def frame(
         self,
         image: Picture,  # [H, W, 3]
     ) -> Picture:

@@ -81,10 +81,10 @@ def _run_network(folder: Path, settings: RuntimeSettings) -> dict[str, Array]:
     card, describer = read_card(folder), describer_in(folder, settings)
     wide = example_picture(card.height, card.width + MOVED_PX)
     pictures = [np.ascontiguousarray(wide[:, :-MOVED_PX]), np.ascontiguousarray(wide[:, MOVED_PX:])]
-    a, b = (describer.features(describer.fitted(picture)) for picture in pictures)
+    a, b = (describer.features(describer.fit(picture)) for picture in pictures)
     width, height = card.width, card.height
     camera = CameraModel(width, height, width, width, 0.5 * width, 0.5 * height)
-    pair = describer.compared(a, b, camera, camera)
+    pair = describer.compare(a, b, camera, camera)
     said: dict[str, Array] = {"features_a": a, "features_b": b}
     if pair.cells is not None:
         said |= {"cells_a": pair.cells[0], "cells_b": pair.cells[1]}

@@ -174,7 +174,7 @@ class McapCamera:
             return None
         return counts.get(self.topic, 0) + counts.get(f"{self._base}/dropped", 0)
 
-    def _placed(self) -> Iterator[tuple[_Place, McapMessage | str]]:
+    def _placed_messages(self) -> Iterator[tuple[_Place, McapMessage | str]]:
         """Pictures with what belongs to them; a sentence instead of one that is missing."""
         extra: dict[str, Any] = {}
         mask: npt.NDArray[np.bool_] | None = None
@@ -200,7 +200,7 @@ class McapCamera:
                 yield place, message if gone is None else gone
 
     def _pictures(self, every: int, start: int) -> Iterator[Frame | Dropped]:
-        for place, found in self._placed():
+        for place, found in self._placed_messages():
             if not is_asked(place.index, every, start):
                 continue
             if isinstance(found, str):
@@ -225,7 +225,7 @@ class McapCamera:
         gone: list[Dropped] = []
 
         def units() -> Iterator[tuple[tuple[_Place, EncodedPicture], bytes]]:
-            for place, found in self._placed():
+            for place, found in self._placed_messages():
                 if isinstance(found, str):
                     gone.append(Dropped(place.index, place.t_ns, found))
                     continue

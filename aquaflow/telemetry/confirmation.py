@@ -52,7 +52,7 @@ class Confirmation:
         nothing before (an altimeter alone, 1.85 s late, was 5.6 sigma wrong after 5 s)."""
         return self.estimates < LEAST_ESTIMATES
 
-    def applied(self, solution: Solution) -> Solution:
+    def apply(self, solution: Solution) -> Solution:
         """The solution with a scale that is no surer than this."""
         covariance = solution.covariance.copy()
         least = min(self.sigma, UNKNOWN_SIGMA) ** 2

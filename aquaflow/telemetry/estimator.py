@@ -69,7 +69,7 @@ def estimate(
         return Estimate(WorldFrame.unknown())
     R_cb = None if mounting is None else camera_in_body(mounting).R.T
     clocks = DeviceClocks.of(telemetry, path, R_cb)
-    telemetry = clocks.corrected(telemetry)
+    telemetry = clocks.correct(telemetry)
     rejected = clocks.unlike(telemetry)
 
     def problem_along(path: CameraPath, points: Callable[[], Array]) -> TelemetryProblem:
@@ -93,7 +93,7 @@ def estimate(
         confirmation = confirmation_of(path, lambda part: problem_along(part, lambda: ground))
         confirmed = not confirmation.vague
         if confirmed and (confirmation.refuted or not clocks.known):
-            solution = confirmation.applied(solution)
+            solution = confirmation.apply(solution)
             problem.doubt = f"{confirmation.in_words()}, and {clocks.why_open}"
     frame = replace(frame_of(problem, solution, path), scale_confirmed=confirmed)
-    return Estimate(clocks.stated(frame), problem, solution)
+    return Estimate(clocks.with_clocks(frame), problem, solution)

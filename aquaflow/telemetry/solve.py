@@ -104,7 +104,7 @@ class _Derivatives:
             self._found, self._moved = [factor.jacobian(state) for factor in self.factors], 0.0
         return self._found
 
-    def moved(self, sigmas: float) -> None:
+    def note_move(self, sigmas: float) -> None:
         """The state has moved so far."""
         self._moved += sigmas
 
@@ -180,14 +180,14 @@ def _descend(
             A, b = A + J.T @ J, b - J.T @ r
         step = _step(A, b, damping)
         step *= min(1.0, LONGEST_TURN / max(float(np.abs(step[:4]).max()), LONGEST_TURN))
-        trial, away = state.moved(step), departed + step
+        trial, away = state.move(step), departed + step
         after = cost(trial, away)
         if not after <= best * (1.0 + 1e-12):
             damping = 10.0 * max(damping, 1e-6)
             continue
         state, departed, best, damping = trial, away, after, 0.1 * damping
         length = float(np.sqrt(step @ A @ step))
-        derivatives.moved(length)
+        derivatives.note_move(length)
         if length < SETTLED:
             break
     return state, departed, inverse_of(A)

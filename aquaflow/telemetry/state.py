@@ -48,7 +48,7 @@ class MetricState:
         """Metres per map unit."""
         return float(np.exp(self.log_scale))
 
-    def moved(
+    def move(
         self,
         step: Array,  # [P]
     ) -> MetricState:

@@ -89,7 +89,7 @@ def _solve(
     damping, cost = 1e-4, _cost(observations, state, weighting)
     equations = LensEquations(observations, state, weighting)
     for _ in range(ITERATIONS):
-        candidate = equations.stepped(damping, terms)
+        candidate = equations.step(damping, terms)
         new_cost = _cost(observations, candidate, weighting)
         if not np.isfinite(new_cost) or new_cost >= cost:
             damping *= DAMPING_GROWTH
@@ -116,7 +116,9 @@ def _covariance(
     equations = LensEquations(observations, state, weighting)
     H = equations.hessian
     free = slice(0, len(H) - TERMS + terms)
-    inverse: Array = np.asarray(np.linalg.inv(equations.held(H)[free, free]), dtype=np.float64)
+    inverse: Array = np.asarray(
+        np.linalg.inv(equations.hold_gauge(H)[free, free]), dtype=np.float64
+    )
     scatter = np.zeros_like(inverse)
     for cluster in np.unique(clusters):
         gradient = equations.gradient(clusters == cluster)

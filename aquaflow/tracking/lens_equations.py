@@ -131,7 +131,7 @@ class LensEquations:
         gain = self._g_p[points] / self._H_pp[points]
         return np.asarray(direct - gain @ self._H_pc[points])
 
-    def held(
+    def hold_gauge(
         self,
         H: Array,  # [C, C]
     ) -> Array:
@@ -140,13 +140,13 @@ class LensEquations:
         extra[-TERMS:] += LENS_PRIOR_SIGMA**-2.0
         return H + np.diag(extra)
 
-    def stepped(self, damping: float, terms: int) -> LensUnknowns:
+    def step(self, damping: float, terms: int) -> LensUnknowns:
         """The state after a damped step in which only the first ``terms`` of the lens move."""
         state = self._state
         H, gradient = self.hessian, self.gradient(np.ones(len(state.rho), dtype=bool))
         gradient[-TERMS:] += state.lens / LENS_PRIOR_SIGMA**2
         free = slice(0, len(H) - TERMS + terms)
-        A = self.held(H) + damping * np.diag(np.diag(H))
+        A = self.hold_gauge(H) + damping * np.diag(np.diag(H))
         step = np.zeros(len(H))
         step[free] = -np.linalg.solve(A[free, free], gradient[free])
         moves = step[:-TERMS].reshape(-1, 6)

@@ -55,7 +55,7 @@ class _Points:
         self.seen: list[list[Seen]] = []
         self._owner: dict[Seen, int] = {}
 
-    def known(self, keypoint: Seen) -> bool:
+    def is_known(self, keypoint: Seen) -> bool:
         return keypoint in self._owner
 
     def add(self, a: Seen, b: Seen) -> None:
@@ -81,7 +81,7 @@ def match_pixels(
         mine, theirs = match_keypoints(views[i].keypoints, views[j].keypoints)
         if len(mine) < MIN_PAIR_MATCHES:
             continue
-        known = np.array([points.known((i, a)) for a in mine.tolist()])
+        known = np.array([points.is_known((i, a)) for a in mine.tolist()])
         for row in _choose(known).tolist():
             points.add((i, int(mine[row])), (j, int(theirs[row])))
     seen = [each for each in points.seen if len(each) > 1]

@@ -94,7 +94,7 @@ class MapStart:
             return None
         with self._failures.contain("initialisation", initialiser.frame.index):
             started = self._solve(initialiser)
-        return self._taken(started)
+        return self._take_started(started)
 
     def begin_learned(self) -> NewMap | None:
         """A map from the reference and the picture after it, by the prior's ranges; None where it
@@ -103,10 +103,10 @@ class MapStart:
         if initialiser is None or len(initialiser.waiting) != 1:
             return None
         with self._failures.contain("learned start", initialiser.frame.index):
-            started = self._begun(initialiser)
-        return self._taken(started)
+            started = self._begin_map(initialiser)
+        return self._take_started(started)
 
-    def _begun(self, initialiser: Initialiser) -> NewMap | None:
+    def _begin_map(self, initialiser: Initialiser) -> NewMap | None:
         reference, second = initialiser.frame, initialiser.waiting[0]
         camera = initialiser.reference.camera
         found = learned_start(second.pair, camera, self._config)
@@ -115,7 +115,7 @@ class MapStart:
         posed = [PosedFrame(second.frame, found.T_fk, second.pair)]
         return NewMap(reference, initialiser.reference, found.pointmap, camera, 0.0, posed)
 
-    def _taken(self, started: NewMap | None) -> NewMap | None:
+    def _take_started(self, started: NewMap | None) -> NewMap | None:
         """The frames of a map that starts are in hand, and no reference is waited for."""
         if started is not None:
             frames = [started.reference, *(posed.frame for posed in started.posed)]
@@ -218,7 +218,7 @@ def _pose(
         return None, 1.0
     step = -(-len(rows) // MATCHES)
     rows, columns = rows[::step], columns[::step]
-    pointmap = replace(Pointmap.unknown(camera), learned=depth_a.kept).completed(1.0)
+    pointmap = replace(Pointmap.unknown(camera), learned=depth_a.kept).complete(1.0)
     pixels_a = np.stack([columns + 0.5, rows + 0.5], -1)
     pixels_b = pair.matches[rows, columns].astype(np.float64)
     weights = pair.C[rows, columns].astype(np.float64)

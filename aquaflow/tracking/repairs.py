@@ -96,7 +96,7 @@ def rescale(at: CurrentKeyframe, ratio: float) -> None:
     by 2 to 8 % within ten frames).
     """
     pointmap = at.keyframe.pointmap
-    known = pointmap.known(1.0)
+    known = pointmap.is_known(1.0)
     pointmap.rho *= ratio
     pointmap.variance[known] *= ratio**2
     pointmap.fused = MOST_FUSED
@@ -107,7 +107,7 @@ def rescale(at: CurrentKeyframe, ratio: float) -> None:
 
 def doubt(pointmap: Pointmap) -> None:
     """Let the next frames' depths replace those of ``pointmap``, which stay known until then."""
-    known = pointmap.known(1.0)
+    known = pointmap.is_known(1.0)
     least = (DOUBT * pointmap.rho) ** 2
     pointmap.variance[known] = np.maximum(pointmap.variance, least)[known]
     pointmap.fused = 0

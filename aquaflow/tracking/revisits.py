@@ -32,7 +32,7 @@ def find_revisit(
     ``pointmap``: the frame's depths in the unit of ``at``; None where too few of them are known.
     """
     earlier = back.keyframe.pointmap
-    points = sample(earlier, earlier.known(KNOWN_SIGMA), RATIO_POINTS)[2]
+    points = sample(earlier, earlier.is_known(KNOWN_SIGMA), RATIO_POINTS)[2]
     ratio = depth_ratio(points, solved_back.estimate.T, pointmap, KNOWN_SIGMA)
     if ratio is None:
         return None

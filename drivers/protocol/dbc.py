@@ -50,7 +50,7 @@ class DbcDecoder(PacketDecoder):
     def __init__(self, name: str, config: DbcConfig) -> None:
         super().__init__(name, CanFraming())
         self._cantools = load("cantools", f"the CAN device '{name}'")
-        database = self._opened(config.database)
+        database = self._open_file(config.database)
         self._fixes = Fixes(config)
         self._mapped: dict[tuple[int, bool], tuple[Any, list[DbcSignal]]] = {}
         for mapping in config.samples:
@@ -83,7 +83,7 @@ class DbcDecoder(PacketDecoder):
             return self._fixes.fix(t_ns, t_ns, source, scaled[0], scaled[1], sigma_of(None))
         return [_in_body(mapping, scaled, t_ns, source)]
 
-    def _opened(self, path: str) -> Any:
+    def _open_file(self, path: str) -> Any:
         try:
             return self._cantools.database.load_file(path, database_format="dbc")
         except (OSError, ValueError, self._cantools.Error) as error:

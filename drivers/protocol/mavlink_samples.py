@@ -140,7 +140,7 @@ class MavlinkSamples:
         sigma_m = message.h_acc / 1000.0 or sigma_of(hdop)
         found = self._fixes.fix(*stamp, message.lat * DEGREES, message.lon * DEGREES, sigma_m)
         if message.time_usec > SINCE_1970_US:
-            t_ns = self._fixes.dated(stamp.t_ns)
+            t_ns = self._fixes.date(stamp.t_ns)
             found.append(UtcTime(t_ns, *stamp[1:], 1000 * message.time_usec))
         return found
 

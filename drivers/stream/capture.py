@@ -60,8 +60,8 @@ class StreamCapture:
             self._damaged -= 1
             return RawPicture(arrival_ns, rgb_of(None), stale=self._stale)
         self._grabbed = False
-        exposed_ns, self._stale = self._ages.judged(self._stream_ns(), arrival_ns)
-        shown = None if self._stale else self._retrieved()
+        exposed_ns, self._stale = self._ages.judge(self._stream_ns(), arrival_ns)
+        shown = None if self._stale else self._retrieve()
         if shown is None or not self._sends_jpeg:
             return RawPicture(arrival_ns, rgb_of(shown), exposed_ns, stale=self._stale)
         jpeg = shown.reshape(-1)
@@ -99,7 +99,7 @@ class StreamCapture:
 
         return round(1e6 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
 
-    def _retrieved(self) -> npt.NDArray[np.uint8] | None:
+    def _retrieve(self) -> npt.NDArray[np.uint8] | None:
         """[H, W, 3] BGR, or the bytes of a JPEG file; must be fetched before the next picture is
         grabbed, used or not."""
         decoded, bgr = self._capture.retrieve()

@@ -65,7 +65,7 @@ class StreamedCapture:
     def __init__(self, device: V4l2Capture, stall_s: float) -> None:
         self.notes, self.format = device.notes, device.format
         self._device, self._stall_s = device, stall_s
-        self._pictures = decode(self._received())
+        self._pictures = decode(self._receive_pictures())
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; waits up to the configured stall time for it.
@@ -80,7 +80,7 @@ class StreamedCapture:
         self._pictures.close()
         self._device.close()
 
-    def _received(self) -> Iterator[tuple[RawPicture, Units]]:
+    def _receive_pictures(self) -> Iterator[tuple[RawPicture, Units]]:
         """What the device sends, in memory of its own."""
         heard_s = time.monotonic()
         while True:

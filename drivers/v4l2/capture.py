@@ -49,7 +49,7 @@ class V4l2Capture:
         self._open = True
         try:
             self._layout = layout_of(capabilities(system, self._fd))
-            self.settled = self._layout.settled(system, self._fd, config)
+            self.settled = self._layout.negotiate_format(system, self._fd, config)
             fps, rate_notes = self._set_rate(config)
             controls = apply_controls(system, self._fd, config)
             self._maps = [self._map(index) for index in range(self._request(config.buffers))]
@@ -96,7 +96,7 @@ class V4l2Capture:
         starts = buffer.flags & abi.BUF_FLAG_TSTAMP_SRC_MASK == abi.BUF_FLAG_TSTAMP_SRC_SOE
         if not starts and self._exposure_s is not None:
             stamp_ns -= round(self._exposure_s * 1e9)
-        used = self._layout.used(buffer)
+        used = self._layout.picture_slices(buffer)
         data = [place[part] for place, part in zip(self._maps[buffer.index], used, strict=True)]
         return RawPicture(
             arrival_ns=self._now_ns(),

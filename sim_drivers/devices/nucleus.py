@@ -46,15 +46,15 @@ class Nucleus:
 
     def answer(self, packet: bytes, now_ns: int) -> list[bytes]:
         *lines, self._heard = (self._heard + packet).split(b"\r\n")
-        return [answer for line in lines for answer in self._answered(line)]
+        return [answer for line in lines for answer in self._answer(line)]
 
-    def unprompted(self, now_ns: int) -> list[bytes]:
+    def due_packets(self, now_ns: int) -> list[bytes]:
         if self.password is None or (self._asked_ns and now_ns - self._asked_ns < ASK_NS):
             return []
         self._asked_ns = now_ns
         return [PROMPT]
 
-    def _answered(self, line: bytes) -> list[bytes]:
+    def _answer(self, line: bytes) -> list[bytes]:
         self.commands.append(line)
         if self.password is not None:
             if line != self.password.encode():

@@ -81,7 +81,7 @@ class Rounds(_Pumps):
 
     def _swim(self) -> None:
         for frame in itertools.islice(self.pictures(), self._count):
-            while not self.newest.asked(ASK_S):
+            while not self.newest.wait_for_consumer(ASK_S):
                 if self.closing.is_set():
                     return
             self.newest.put(replace(frame, arrival_ns=time.monotonic_ns()))

@@ -218,7 +218,7 @@ def test_too_little_of_either_is_refused() -> None:
     with pytest.raises(NotSynchronisedError, match=r"the log's rotations cover 3\.9 s"):
         estimate_time_offset(case.camera, steady(4.0, 0.1))
     with pytest.raises(NotSynchronisedError, match=r"the video's poses cover 0\.0 s"):
-        estimate_time_offset(Turns.joined([]), case.body)
+        estimate_time_offset(Turns.join([]), case.body)
 
 
 def test_a_log_without_rotations_is_refused_by_name() -> None:

@@ -94,7 +94,7 @@ def test_a_picture_is_a_view_only_after_motion() -> None:
     for index in range(10):
         views.offer(index, Sim3.identity(), 0, 1.0, lambda: NOTHING)
 
-    assert len(views.posed({index: Sim3.identity() for index in range(10)})) == 1
+    assert len(views.posed_views({index: Sim3.identity() for index in range(10)})) == 1
 
 
 def test_too_many_views_are_thinned_until_neighbours_no_longer_overlap() -> None:
@@ -106,7 +106,7 @@ def test_too_many_views_are_thinned_until_neighbours_no_longer_overlap() -> None
             views.thin()
 
     poses = {i: sideways(0.01, i) for i in range(index)}
-    kept = views.posed(poses)
+    kept = views.posed_views(poses)
     assert len(kept) == MOST_VIEWS
     gap = kept[-1].T_wc.t[0] - kept[-2].T_wc.t[0]
     assert gap * GUESS.fx / GUESS.width == pytest.approx(LAST_SPACING, rel=0.1)
@@ -117,8 +117,8 @@ def test_views_are_of_the_sub_map_with_most_of_them() -> None:
     for index in range(9):
         views.offer(index, sideways(0.1, index), int(index >= 3), 1.0, lambda: NOTHING)
 
-    assert len(views.posed({index: sideways(0.1, index) for index in range(9)})) == 6
-    assert views.posed({}) == []
+    assert len(views.posed_views({index: sideways(0.1, index) for index in range(9)})) == 6
+    assert views.posed_views({}) == []
 
 
 def test_motion_counts_turns_and_the_way_over_the_range() -> None:

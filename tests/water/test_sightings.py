@@ -113,7 +113,7 @@ def test_a_masked_vehicle_is_not_sighted() -> None:
     for centre in BACKING:
         whole = wall_picture(centre)
         z = ranges_of_the_wall(centre).astype(np.float32)
-        image = np.rint(whole.sampled(CAMERA.pixel_centres(), np.full(120, 0.1)) * 255.0)
+        image = np.rint(whole.sample(CAMERA.pixel_centres(), np.full(120, 0.1)) * 255.0)
         view = View(0, image.astype(np.uint8), CAMERA, Sim3(np.eye(3), centre), 0, False, view_mask)
         pictures.append(PosedPicture(view, torch.from_numpy(z), torch.ones(120, 160)))
     seen = looked(pictures)

@@ -54,7 +54,7 @@ def _attempt(job: BatchJob, started: RunningProcesses) -> BatchOutcome:
             "install the same on every machine"
         )
     site = open_site(job.site)
-    found = site.finished(job)
+    found = site.finished_outcome(job)
     if found is not None:
         return found
     with working_folder(site.work_parent(job), job.name) as work:

@@ -193,7 +193,7 @@ def radiance(
     footprint = t * pixel * facing.rsqrt() / TEXEL_M
     place = 311.0 * float(shape.centre[0])
     shift = (place if shape.pattern_m is None else shape.pattern_m / TEXEL_M) % TEXELS
-    noise = texture.mirrored(u / TEXEL_M + shift, v / TEXEL_M + 2.0 * shift, footprint)
+    noise = texture.mirror(u / TEXEL_M + shift, v / TEXEL_M + 2.0 * shift, footprint)
     grown = torch.sigmoid(5.0 * (noise[1] + 2.4 * (shape.covered - 0.5)))
     grain = GRAIN if shape.tile_m == 0.0 else GLAZE_GRAIN
     paint = torch.tensor(shape.paint)[:, None] * (1.0 + grain * noise[0])

@@ -245,7 +245,7 @@ def _grain(
     """Relative change [N] of the radiance on steep faces; ``size`` (m) is the ray's footprint."""
     texel = objects.TEXEL_M
     u, v = (0.8 * x + 0.6 * y) / texel, (z + 0.5 * (0.8 * y - 0.6 * x)) / texel
-    grain, patches = scene.object_texture.mirrored(u, v, size / texel)
+    grain, patches = scene.object_texture.mirror(u, v, size / texel)
     change: torch.Tensor = (0.32 * grain + 0.22 * patches).clamp(-0.75, 0.9)
     return change
 

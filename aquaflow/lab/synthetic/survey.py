@@ -156,7 +156,7 @@ class SurveyPictures:
         return Sim3(turn, np.array([x, y, 0.0]) + sway[:3] * SWAY_M)
 
     def _picture(self, index: int) -> npt.NDArray[np.uint8]:
-        x, y, ahead, box = self._met(self.T_wc(index))
+        x, y, ahead, box = self._intersect_seabed(self.T_wc(index))
         brightness = _sum(self._texture, x, y, box)
         tint = _sum(self._tint, x, y, box)
         log_colours = np.stack([brightness + tint, brightness, brightness - tint], axis=-1)
@@ -166,7 +166,7 @@ class SurveyPictures:
         seen += np.float32(NOISE) * rng.standard_normal(seen.shape, np.float32)
         return quantise(seen)
 
-    def _met(self, T_wc: Sim3) -> tuple[Map, Map, Map, Box]:
+    def _intersect_seabed(self, T_wc: Sim3) -> tuple[Map, Map, Map, Box]:
         """[H, W] each: x and y in m of where a pixel's ray meets the seabed, and how many of its
         lengths that is away; and a box around all of these places."""
         along_x, along_y, down = np.moveaxis(self._rays @ T_wc.R.T.astype(np.float32), -1, 0)

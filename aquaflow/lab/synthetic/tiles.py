@@ -28,7 +28,7 @@ def lay(
 ) -> torch.Tensor:
     """Albedo [3, N] of a surface with tiles."""
     column, row = torch.floor(u / edge_m), torch.floor(v / edge_m)
-    tint = texture.mirrored(APART[0] * column, APART[1] * row, torch.ones_like(u))[0]
+    tint = texture.mirror(APART[0] * column, APART[1] * row, torch.ones_like(u))[0]
     # Beyond a tile's size the tints average out.
     tint = TINT * tint * (edge_m / footprint.clamp_min(edge_m))
     joint = 1.0 - (1.0 - _joint(u, footprint, edge_m)) * (1.0 - _joint(v, footprint, edge_m))

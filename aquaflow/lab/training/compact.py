@@ -113,7 +113,7 @@ class CompactTask:
         if self.real is not None:
             parts.append(self.real.pairs(draw, real))
         clear = join(parts)
-        conditions = settings.conditions.scaled(min(step / max(settings.calm_steps, 1), 1.0))
+        conditions = settings.conditions.scale(min(step / max(settings.calm_steps, 1), 1.0))
         pair = training_pair(draw, clear, self.looks_at(step), conditions)
         ranged = torch.arange(settings.batch, device=self.device) < settings.batch - real
         terms = compact_losses(self.network, pair, settings, draw, ranged)

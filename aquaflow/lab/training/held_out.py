@@ -50,7 +50,7 @@ SETS = {
     "wide": HeldOutSet("held_out", WIDE),
     "wider": HeldOutSet("held_out_wider", WIDER),
     "hard": HeldOutSet(
-        "held_out_hard", TRAINING, Detail(regular=0.3), Conditions().scaled(2.0), SEED + 1
+        "held_out_hard", TRAINING, Detail(regular=0.3), Conditions().scale(2.0), SEED + 1
     ),
 }
 """Those that figures are given for; ``hard`` has all that a training has, twice as often."""

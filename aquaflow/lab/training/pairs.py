@@ -56,7 +56,7 @@ class Pair:
     a: ViewBatch
     b: ViewBatch
 
-    def swapped(self) -> Pair:
+    def swap(self) -> Pair:
         """The same pair, seen from b."""
         return Pair(self.b, self.a)
 

@@ -98,7 +98,7 @@ class Checkpointer:
             try:
                 files = self._slam.keyframes.save()
             except OSError as error:  # what it would name is not there
-                self._failed(error)
+                self._record_failure(error)
                 return
         moment = replace(ClockReading.now(), dive_shift_ns=self._shift_ns())
         head = {"format": FORMAT, "version": __version__, "moment": moment.to_json()}
@@ -130,12 +130,12 @@ class Checkpointer:
             self.taken += 1
             self.size_bytes = state_file(self._dive).stat().st_size
         except (InputError, OSError) as error:
-            self._failed(error)
+            self._record_failure(error)
         finally:
             self.wrote_s = time.monotonic() - began
             self._writing = False
 
-    def _failed(self, error: Exception) -> None:
+    def _record_failure(self, error: Exception) -> None:
         """Count a failed write; the previous checkpoint stays usable."""
         self.failures += 1
         log.warning("no checkpoint: %s", error)

@@ -75,7 +75,7 @@ def cloud_of(moment: MapMoment, budget: int) -> npt.NDArray[np.void] | None:
         scales = np.exp(plain["log_scales"])
     splats = PlyGaussians(plain["means"], plain["quats"], scales, opacities, moment.copy.clear)
     where = placement(moment.frame)
-    upright = splats.transformed(moment.frame.T_nm).transformed(where.T_un)
+    upright = splats.transform(moment.frame.T_nm).transform(where.T_un)
     points = messages.packed_points(PointCloud(upright, moment.views, where))
     return points[:: -(-len(points) // budget)] if len(points) else points
 

@@ -122,14 +122,14 @@ class _Answers:
     def __call__(self, request: HttpRequest) -> HttpResponse:
         """The answer with the headers that all have."""
         posted = request.method == "POST"
-        answer = self.posted(request) if posted else self.looked(request)
+        answer = self.answer_post(request) if posted else self.answer_get(request)
         headers = [*policies(request.headers.get("host", "")), *answer.headers]
         shown = request.target, request.headers, request.peer
         if answer.status != HTTPStatus.FORBIDDEN and self.access.by_query(*shown):
             headers.append(("Set-Cookie", self.access.cookie()))
         return replace(answer, headers=headers)
 
-    def looked(self, request: HttpRequest) -> HttpResponse:
+    def answer_get(self, request: HttpRequest) -> HttpResponse:
         """To a GET."""
         path = path_of(request.target)
         if path is None:
@@ -140,7 +140,7 @@ class _Answers:
             return _json(403, NOT_ALLOWED)
         return self.data(path)
 
-    def posted(self, request: HttpRequest) -> HttpResponse:
+    def answer_post(self, request: HttpRequest) -> HttpResponse:
         """To a POST."""
         if request.body is None:
             return _json(413, {"error": "a request holds a token at most"})

@@ -69,7 +69,7 @@ class NeuralField:
         local, shared = features or (self.local, self.shared)
         return self.decoder.trunk(tokens, local, shared, self._observation(tokens, centres))
 
-    def decoded(
+    def decode(
         self,
         trunk: Trunk,
         seen: Tensor,  # [N] bool
@@ -81,7 +81,7 @@ class NeuralField:
         return decode(self.decoder, trunk, parameters, places, centre, self.threads)
 
     @torch.no_grad()
-    def baked(
+    def bake_parameters(
         self,
         centres: Tensor,  # [N, 3] of the camera that each Gaussian is seen from
     ) -> dict[str, Tensor]:

@@ -57,7 +57,7 @@ class ColourChange:
     gains: tuple[float, float, float]
     """Of the second day's colours, that were taken off."""
 
-    def bleached(self) -> Array:
+    def bleach(self) -> Array:
         """[N] probability of a place as much lighter and less saturated where nothing changed."""
         up = norm.sf(self.lighter / self.sigma_lighter)
         down = norm.cdf(self.purer / self.sigma_purer)

@@ -59,7 +59,7 @@ class SurfaceComparison:
         """[N] probability of a place as far from 0 as it is, of its colour or its distance, where
         nothing changed."""
         if kind == BLEACHED:
-            return self.colours.bleached()
+            return self.colours.bleach()
         return two_sided(self.distances.distance / self.distances.sigma, self.distances.freedom)
 
 
@@ -126,7 +126,7 @@ def classes(distances: SurfaceDistances, colours: ColourChange, rate: float) -> 
     """[N] of each place; ``rate``: of false discoveries, of distances and of colours each."""
     kinds = np.full(len(distances.distance), NOT_SEEN, np.int8)
     kinds[distances.seen] = UNCHANGED
-    bleached = np.where(distances.seen, colours.bleached(), np.nan)
+    bleached = np.where(distances.seen, colours.bleach(), np.nan)
     kinds[discoveries(bleached, rate)] = BLEACHED
     # What stands there now is another surface, whatever its colour.
     chance = two_sided(distances.distance / distances.sigma, distances.freedom)

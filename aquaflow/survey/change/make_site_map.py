@@ -41,7 +41,7 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
             written to.
     """
     merged = merge_of(site)
-    chosen = merged.chosen(component, site)
+    chosen = merged.choose(component, site)
     days, placed = [], []
     left_out: dict[str, str] = {}
     for dive in read_site(site):
@@ -75,7 +75,7 @@ def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> 
     views = surfaces_of_map(mapper, placed.T_sm, work, partial(progress, f"views of {placed.dive}"))
     ply = "map_clear.ply" if dive.has("map_clear.ply") else "map.ply"
     gaussians = read_ply(dive.file(ply))
-    return DayMap(placed.dive, gaussians.transformed(placed.T_sn), views)
+    return DayMap(placed.dive, gaussians.transform(placed.T_sn), views)
 
 
 def _site_map_part(part: Part, placed: PlacedSubMap, fingerprint: str) -> SiteMapPart:

@@ -167,13 +167,13 @@ class LiveCoverage(CoverageView):
         coverage.look(slam.keyframes, slam.metric_frame)
         coverage.update()
         views = coverage.views(slam.keyframes, slam.metric_frame, self._limits)
-        measured = self._judged(coverage, views)
+        measured = self._judge(coverage, views)
         if self._dive is dive:  # else the dive ended meanwhile
             self.turns += 1
             self._views, self._measured = views, measured
             self.hints = hints.judge(measured)
 
-    def _judged(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> CoverageFigures:
+    def _judge(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> CoverageFigures:
         """The newest values of what hints are about."""
         if not self._places:
             return CoverageFigures()

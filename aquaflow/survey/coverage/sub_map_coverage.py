@@ -113,7 +113,7 @@ class SubMapCoverage:
         drawn = [n for n in numbers if layer is not None and n in layer.drawn]
         if layer is None or not drawn:
             return
-        for number, cells in zip(drawn, self._moved(layer, drawn), strict=True):
+        for number, cells in zip(drawn, self._moved_cells(layer, drawn), strict=True):
             if cells <= UNMOVED:
                 self._slightly.add(number)
             elif self._changed.get(number) != np.inf:
@@ -187,7 +187,7 @@ class SubMapCoverage:
             self._shown, self._next = layer, None
         return missing
 
-    def _moved(self, layer: CoverageLayer, numbers: list[int]) -> Array:
+    def _moved_cells(self, layer: CoverageLayer, numbers: list[int]) -> Array:
         """[K] cells by which the view of each has moved since it was drawn: the most of a point on
         the camera's axis and of two beside it."""
         now = Sim3Batch.of([self._seen[n][1] for n in numbers])

@@ -101,7 +101,7 @@ def rescale(dive: Dive, sub_map: int, lengths: Sequence[KnownLength], scale: Len
             if notes:
                 write_notes(folder, notes, frames[main])
         if sub_map in seen:
-            seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
+            seen[sub_map] = seen[sub_map].rescale(times, frames[sub_map].unit)
             write_coverage(folder, seen, main)
         write_metric_file(folder, frames, main)
 
@@ -126,7 +126,7 @@ def _metric(frame: WorldFrame, lengths: Sequence[KnownLength], scale: LengthScal
 
 
 def _scale(splats: PlyGaussians, times: float) -> PlyGaussians:
-    return splats.transformed(Sim3(np.eye(3), np.zeros(3), times))
+    return splats.transform(Sim3(np.eye(3), np.zeros(3), times))
 
 
 def _rows(rows: Sequence[PoseRow], sub_map: int, frame: WorldFrame, times: float) -> list[PoseRow]:

@@ -77,7 +77,7 @@ class MergedSite:
         """The sub-maps of a dive."""
         return tuple(each for each in self.sub_maps if each.dive == name)
 
-    def chosen(self, component: int | None, site: Path) -> int:
+    def choose(self, component: int | None, site: Path) -> int:
         """The component that was asked for; None: the one with most keyframes.
 
         Raises:

@@ -137,7 +137,7 @@ def fill(page: ViewerPage, dive: FinishedDive) -> None:
         page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)
     else:
         page.show_splats(dive.splats, dive.water, dive.palettes)
-    path = dive.path.thinned()
+    path = dive.path.thin()
     page.show_path(path.rows, path.moments, path.began)
     page.show_pictures(path.pictures)
     if path.poses:

@@ -68,9 +68,9 @@ class ViewerServer:
         self._server.close()
 
     def _answer(self, request: HttpRequest) -> HttpResponse:
-        return self._tool(request) if request.method == "POST" else self._looked(request)
+        return self._tool(request) if request.method == "POST" else self._answer_get(request)
 
-    def _looked(self, request: HttpRequest) -> HttpResponse:
+    def _answer_get(self, request: HttpRequest) -> HttpResponse:
         path = path_of(request.target) or ""
         shown = request.target, request.headers, request.peer
         if not self._access.allows(*shown):

@@ -58,7 +58,7 @@ def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
         InputError: there is no merged site, no such component, or no dive of it that is as it was.
     """
     merged = merge_of(site)
-    chosen = merged.chosen(component, site)
+    chosen = merged.choose(component, site)
     dives = {dive.name: dive for dive in read_site(site)}
     shown, left_out = [], {}
     for name, before in merged.fingerprints.items():

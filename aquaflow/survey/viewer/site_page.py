@@ -103,7 +103,7 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
 
 
 def _own_map(placed: PlacedDive) -> PlyGaussians:
-    return read_ply(placed.dive.ply).transformed(placed.T_sn)
+    return read_ply(placed.dive.ply).transform(placed.T_sn)
 
 
 def _one_map(shown: ShownSite) -> list[PlyGaussians] | None:
@@ -124,7 +124,7 @@ def _show_paths(page: ViewerPage, shown: ShownSite) -> None:
     pictures: dict[int, Path] = {}
     first = before = 0
     for placed in shown.dives:
-        path = placed.path.thinned(max(1, LONGEST_PATH // len(shown.dives)))
+        path = placed.path.thin(max(1, LONGEST_PATH // len(shown.dives)))
         own = path.moments.copy()
         own[:, PICTURE] += before
         if not _same_north(placed, shown):

@@ -221,7 +221,7 @@ class Adjuster:
             if pair is not None and float(pair.valid.mean()) > LEAST_SHARE:
                 see_each_other(job.points[earlier.number], job.points[later.number], pair)
 
-    def applied(self) -> None:
+    def apply(self) -> None:
         """Keep the matches that the last job made, and count it."""
         outcome, self._outcome = self._outcome, None
         if outcome is None:

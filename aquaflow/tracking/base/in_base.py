@@ -108,7 +108,7 @@ class InBase:
         news, self._news = self._news, False
         return news
 
-    def moved(self) -> None:
+    def follow_moves(self) -> None:
         """Keyframes have other poses or sub-maps than before."""
         self._placed = None
 
@@ -262,7 +262,7 @@ KEPT = 32
 class Recognised:
     """A picture of this dive at a keyframe of the base."""
 
-    fit_sub_map: KeyframePlace
+    place: KeyframePlace
     proof: Verified
     """``proof.estimate.T`` is T_kb, from the base's keyframe to this dive's, with scale."""
 

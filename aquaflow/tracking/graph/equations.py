@@ -91,7 +91,7 @@ class Misfit:
         self.r, self.T_ba = residuals(poses, edges)
         self.chi2 = chi_squares(self.r, edges)
 
-    def moved(self, poses: Sim3Batch) -> Misfit:
+    def move(self, poses: Sim3Batch) -> Misfit:
         """The same edges at other poses."""
         return Misfit(poses, self.edges, self.allowed, self.huber)
 

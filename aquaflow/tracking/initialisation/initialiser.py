@@ -140,7 +140,7 @@ class Initialiser:
         camera, pixels = self.reference.camera, self._pixels_reference
         hypotheses = Hypotheses(camera, pixels, self.waiting, self._config)
         result = hypotheses.best()
-        explained = 0.0 if result is None else hypotheses.explained(result.bundle)
+        explained = 0.0 if result is None else hypotheses.explained_share(result.bundle)
         trusted = result is not None and self._trustworthy(explained, result)
         self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
         if result is None or not trusted:

@@ -76,7 +76,7 @@ def learned_depth(
     ``known_sigma``; None if they are too few, or contradict a range that is known up to a
     shift."""
     learned = _is_learned(X, Q)
-    rows, columns = np.nonzero(learned & pointmap.known(known_sigma))
+    rows, columns = np.nonzero(learned & pointmap.is_known(known_sigma))
     if len(rows) < LEAST_COMMON:
         return None
     step = -(-len(rows) // COMPARED)

@@ -98,5 +98,5 @@ class Neighbours:
 
 def sketch(keyframe: Keyframe, config: TrackingConfig) -> Array:
     """[M, 3] some points of a keyframe, in its camera frame."""
-    known = keyframe.pointmap.known(config.known_sigma)
+    known = keyframe.pointmap.is_known(config.known_sigma)
     return sample(keyframe.pointmap, known, SKETCH_POINTS)[2]

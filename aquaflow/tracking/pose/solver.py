@@ -98,7 +98,7 @@ def solve_pose(
         damping = max(damping * 0.1, 1e-9)
         if still:
             break
-    return _summary(problem, matches, T, H, *equations.left(T))
+    return _summary(problem, matches, T, H, *equations.linearise_at(T))
 
 
 class RowEquations:
@@ -112,7 +112,7 @@ class RowEquations:
         rows, weights = self._linearise(self._matches, T), self._matches.weights
         return *_normal_equations(rows, weights), _cost(rows.residual, weights)
 
-    def left(self, T: Sim3) -> tuple[Array, Array]:
+    def linearise_at(self, T: Sim3) -> tuple[Array, Array]:
         """Residuals [K, M] at ``T``, and what each match pulls by [n, M]: weighted J' residual."""
         rows = self._linearise(self._matches, T)
         pull = _huber_weights(rows.residual) * rows.residual * self._matches.weights

@@ -110,7 +110,7 @@ def live(
         foxglove = LiveFoxglove(config, lambda: report(dive.parts, 1e6))
         loop.watchers.append(foxglove.update)
         listener = Listener(example, foxglove.port)
-        until(lambda: foxglove._server.wanted(topics.POINTS))
+        until(lambda: foxglove._server.is_wanted(topics.POINTS))
         try:
             for frame in frames:
                 loop.take(replace(frame, arrival_ns=time.monotonic_ns()))
@@ -228,14 +228,14 @@ def test_a_slow_client_loses_messages_and_no_other_does(
     number = next(c["id"] for c in channels if c["topic"] == topics.CAMERA)
     wanted = [{"id": 1, "channelId": number}]
     slow.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-    until(lambda: server.wanted(topics.CAMERA))
+    until(lambda: server.is_wanted(topics.CAMERA))
     large = messages.jpeg(0, "x", np.zeros((8, 8, 3), np.uint8))
     large.data = np.zeros(4_000_000, np.uint8)
     count = 8 * BACKLOG
     for t_ns in range(count):  # 1 GB: neither the sockets nor the backlog hold it
         server.send(topics.CAMERA, t_ns, large)
     quick = Listener(example, server.port)
-    until(lambda: server.wanted(topics.TF))
+    until(lambda: server.is_wanted(topics.TF))
     small = messages.transforms(count, [])
     until(lambda: bool(quick.received[topics.TF]), lambda: server.send(topics.TF, count, small))
     quick.close()
@@ -256,10 +256,10 @@ def test_what_nobody_has_asked_for_is_not_encoded(
     server: FoxgloveServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[object] = []
-    monkeypatch.setattr("aquaflow.live.foxglove.server.encoded", asked.append)
+    monkeypatch.setattr("aquaflow.live.foxglove.server.encode", asked.append)
     server.send(topics.CAMERA, 1, BIG)
     assert asked == []
-    assert not server.wanted(topics.CAMERA)
+    assert not server.is_wanted(topics.CAMERA)
 
 
 def test_an_address_that_is_taken_is_one_sentence(server: FoxgloveServer) -> None:
@@ -347,7 +347,7 @@ def test_the_example_node_hands_messages_on_byte_for_byte(
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    until(lambda: server.wanted(topics.TF_STATIC) and server.wanted(topics.CAMERA))
+    until(lambda: server.is_wanted(topics.TF_STATIC) and server.is_wanted(topics.CAMERA))
     static = messages.transforms(5, [])
     server.send(topics.TF_STATIC, 5, static)
     server.send(topics.CAMERA, 6, BIG)

@@ -135,9 +135,9 @@ def with_buttons(answers: type[Any], dive: SimulatedDive) -> type[Any]:
                 return HttpResponse(200, "image/jpeg", dive.picture())
             return super().data(path)
 
-        def posted(self, request: HttpRequest) -> HttpResponse:
+        def answer_post(self, request: HttpRequest) -> HttpResponse:
             if not request.target.startswith("/dive/"):
-                return super().posted(request)
+                return super().answer_post(request)
             if not self.access.allows(request.target, request.headers, request.peer):
                 return HttpResponse(403, "application/json", b'{"error": "give the token"}')
             code, said = dive.act(request.target.rpartition("/")[2])

@@ -43,7 +43,7 @@ class TimedPart:
     """False: the work has its own threads, and torch's would only spin in addition."""
     device: torch.device = CPU
 
-    def timed(self, clock: Clock) -> tuple[float, float]:
+    def measure_time(self, clock: Clock) -> tuple[float, float]:
         """Milliseconds on the wall, and of this thread's CPU time."""
         meter = meter_of(self.device)
         with torch_threads(self.threads if self.uses_torch_threads else 1):
@@ -119,14 +119,14 @@ def time_parts(
 
     def job(part: TimedPart) -> Callable[[], tuple[float, float]]:
         def timed() -> tuple[float, float]:
-            sample = part.timed(clock)
+            sample = part.measure_time(clock)
             tick()
             return sample
 
         return timed
 
     for part in parts:
-        part.timed(clock)
+        part.measure_time(clock)
     results = interleave([job(part) for part in parts], repeats)
     return [_row(part, samples) for part, samples in zip(parts, results, strict=True)]
 

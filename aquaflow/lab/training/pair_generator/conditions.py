@@ -32,7 +32,7 @@ class Conditions:
     low_light: float = 0.1
     overlay: float = 0.1
 
-    def scaled(self, factor: float) -> Conditions:
+    def scale(self, factor: float) -> Conditions:
         """All shares times ``factor``: a training begins with what is easy."""
         return Conditions(*(factor * getattr(self, field.name) for field in fields(self)))
 

@@ -61,7 +61,7 @@ def training_pair(
 ) -> Pair:
     """One use of pairs without water: other windows, another water, another camera."""
     if bool(draw.chance(0.5)):
-        clear = clear.swapped()
+        clear = clear.swap()
     same = draw.chance(looks.same_place, len(clear.a.K))
     clear = Pair(clear.a, _choose(same, clear.a, clear.b))
     pair = through_water(draw, windows(draw, clear, looks), conditions)

@@ -104,7 +104,7 @@ class MapPool(StoredPairs):
         """The map, read when it is first needed: not where all pairs are on disk."""
         return MappedScene(self.map_file)
 
-    def rendered(self, shard: int) -> Pair:
+    def render(self, shard: int) -> Pair:
         draw = Draw(self.seed * STRIDE + shard)
         found: list[Pair] = []
         for _ in range(ATTEMPTS):

@@ -36,7 +36,7 @@ class StoredPairs(ABC):
         """Start of the files' names: that of all that their content follows from."""
 
     @abstractmethod
-    def rendered(self, shard: int) -> Pair:
+    def render(self, shard: int) -> Pair:
         """The SHARD pairs of a file: radiances without water."""
 
     def pairs(
@@ -59,7 +59,7 @@ class StoredPairs(ABC):
             return False
         self.folder.mkdir(parents=True, exist_ok=True)
         with torch.no_grad():
-            pair = self.rendered(shard)
+            pair = self.render(shard)
         with atomic_write(path) as stream:
             torch.save(_pack(pair.a, "a") | _pack(pair.b, "b"), stream)
         return True

@@ -115,7 +115,7 @@ def test_what_too_few_views_saw_is_shown_and_not_learnt_from(tmp_path: Path) -> 
 
 def test_files_keep_which_depths_are_not_to_be_learnt(dive: Path, tmp_path: Path) -> None:
     maps = pairs_of([dive], tmp_path)
-    rendered = maps.maps[0].rendered(0)
+    rendered = maps.maps[0].render(0)
     stored = maps.maps[0].pairs(torch.arange(SHARD))
     assert torch.equal(stored.b.valid, rendered.b.valid)
     assert bool((~stored.b.valid & (stored.b.depth > 0)).any())
