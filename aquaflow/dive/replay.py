@@ -27,7 +27,7 @@ from aquaflow.telemetry.time_offset import (
     NotSynchronisedError,
     TimeOffset,
     offset_of_log,
-    synchronised,
+    synchronise_samples,
 )
 from aquaflow.telemetry.turns import Array, Turns
 from aquaflow.tracking.base.base import Base
@@ -196,7 +196,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
                 run.notes.append(str(error))
                 continue
             run.notes.append(in_words(name, offset))
-            for sample in synchronised(samples, offset):
+            for sample in synchronise_samples(samples, offset):
                 run.sample(sample)
             found[name] = offset
     return found
@@ -205,7 +205,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
 def turns_of(results: Sequence[Tracked]) -> Turns:
     """How the camera turned, within every sub-map."""
     posed = [each for each in results if each.T_wc is not None]
-    return Turns.joined(
+    return Turns.join(
         [
             _turns_of_sub_map([each for each in posed if each.sub_map == sub_map])
             for sub_map in sorted({each.sub_map for each in posed})

@@ -175,7 +175,7 @@ class Mapper:
         if self.neural is not None:
             self.neural.move(moved)
         move_views(self.views, moves)
-        self.water_fitting.moved(moves)
+        self.water_fitting.follow_moves(moves)
 
     def use_unit(self, metres_per_unit: float) -> None:
         """The map's unit is known in metres; a decoder's voxels may be given in them."""

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.backward_flow import backward_flow, reverse
-from aquaflow.prior.fields import half_by_area, halved, length, of_size, pixel_grid, sample
+from aquaflow.prior.fields import half_by_area, halve, length, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import is_refinable, refine
 from aquaflow.render.library import library_or_none
 
@@ -234,7 +234,7 @@ class FlowMatcher:
         start: Float,  # [H, W, 2] px, a to b
     ) -> Float:
         """DIS down to a quarter of the size, fitted at half of it."""
-        half_a, half_b = halved(a), halved(b)
+        half_a, half_b = halve(a), halve(b)
         small_a, small_b = a, b
         for _ in range(QUARTER_SCALE):
             small_a, small_b = half_by_area(small_a), half_by_area(small_b)

@@ -108,7 +108,7 @@ class Refinement:
 
     def fit(self, peak: OffsetPeak) -> OffsetFit | None:
         """The optimum near ``peak``; None where too little is measured there."""
-        used = self._used(peak.offset_s)
+        used = self._used_points(peak.offset_s)
         if 3 * used.sum() <= 2 * PARAMETERS:
             return None
         smooth = csr_array(self._smooth[np.flatnonzero(used)])
@@ -117,7 +117,7 @@ class Refinement:
         x, R_cb = np.zeros(PARAMETERS), peak.R_cb
         x[OFFSET] = peak.offset_s
         for _ in range(ITERATIONS):
-            residual, J = self._linearised(x, R_cb, middle_s, smooth, at_s, seen)
+            residual, J = self._linearise(x, R_cb, middle_s, smooth, at_s, seen)
             sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-9)
             weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(residual), 1e-12))
             H = np.einsum("gip,gi,giq->pq", J, weight, J) / sigma**2 + self._prior
@@ -137,7 +137,7 @@ class Refinement:
         whole[used] = residual
         return OffsetFit(x, covariance, R_cb, middle_s, used, whole, self._seen)
 
-    def _used(self, offset_s: float) -> Mask:
+    def _used_points(self, offset_s: float) -> Mask:
         """[G] grid points whose surroundings were measured by both."""
         start_s, end_s = self._camera.start_s - offset_s, self._camera.end_s - offset_s
         _, covered = self._body.within(start_s, end_s)
@@ -145,7 +145,7 @@ class Refinement:
         both = self._smooth @ (length * (covered >= 1.0 - 1e-6))
         return np.asarray((both >= 1.0 - 1e-6) & (self._covered >= COVERED))
 
-    def _linearised(
+    def _linearise(
         self,
         x: Array,  # [9]
         R_cb: Array,  # [3, 3]

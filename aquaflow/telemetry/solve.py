@@ -74,7 +74,7 @@ def solve(
     covariance = np.diag(prior**2)
     for _ in range(ROUNDS):
         residuals = [factor.residuals(state) for factor in factors]
-        kept = tuple(_gated(f, r) for f, r in zip(factors, residuals, strict=True))
+        kept = tuple(_gate(f, r) for f, r in zip(factors, residuals, strict=True))
         noise = tuple(
             likeliest(f.t_s[k], r[k], f.sigma[k], f.slow)
             for f, r, k in zip(factors, residuals, kept, strict=True)
@@ -104,7 +104,7 @@ class _Derivatives:
             self._found, self._moved = [factor.jacobian(state) for factor in self.factors], 0.0
         return self._found
 
-    def moved(self, sigmas: float) -> None:
+    def note_move(self, sigmas: float) -> None:
         """The state has moved so far."""
         self._moved += sigmas
 
@@ -180,14 +180,14 @@ def _descend(
             A, b = A + J.T @ J, b - J.T @ r
         step = _step(A, b, damping)
         step *= min(1.0, LONGEST_TURN / max(float(np.abs(step[:4]).max()), LONGEST_TURN))
-        trial, away = state.moved(step), departed + step
+        trial, away = state.move(step), departed + step
         after = cost(trial, away)
         if not after <= best * (1.0 + 1e-12):
             damping = 10.0 * max(damping, 1e-6)
             continue
         state, departed, best, damping = trial, away, after, 0.1 * damping
         length = float(np.sqrt(step @ A @ step))
-        derivatives.moved(length)
+        derivatives.note_move(length)
         if length < SETTLED:
             break
     return state, departed, inverse_of(A)
@@ -212,7 +212,7 @@ def inverse_of(
     return np.asarray(np.outer(root, root) * cho_solve((scaled, True), np.eye(P)))
 
 
-def _gated(
+def _gate(
     factor: Factor,
     r: Array,  # [N, D]
 ) -> Mask:

@@ -19,7 +19,7 @@ from aquaflow.tracking.lens_equations import (
     LensUnknowns,
     Weighting,
     residuals,
-    triangulated,
+    triangulate,
 )
 
 ROUNDS = 4
@@ -70,7 +70,7 @@ def adjust_lens(
     sigmas: list[float] = []
     weighting = Weighting(1.0, np.zeros(0, dtype=bool))
     for number in range(ROUNDS):
-        state = replace(state, rho=triangulated(observations, state))
+        state = replace(state, rho=triangulate(observations, state))
         size = np.linalg.norm(residuals(observations, state), axis=-1)
         ahead = state.rho[observations.point] > 0.0
         sigma = _sigma(size[ahead])
@@ -89,7 +89,7 @@ def _solve(
     damping, cost = 1e-4, _cost(observations, state, weighting)
     equations = LensEquations(observations, state, weighting)
     for _ in range(ITERATIONS):
-        candidate = equations.stepped(damping, terms)
+        candidate = equations.step(damping, terms)
         new_cost = _cost(observations, candidate, weighting)
         if not np.isfinite(new_cost) or new_cost >= cost:
             damping *= DAMPING_GROWTH
@@ -116,7 +116,9 @@ def _covariance(
     equations = LensEquations(observations, state, weighting)
     H = equations.hessian
     free = slice(0, len(H) - TERMS + terms)
-    inverse: Array = np.asarray(np.linalg.inv(equations.held(H)[free, free]), dtype=np.float64)
+    inverse: Array = np.asarray(
+        np.linalg.inv(equations.hold_gauge(H)[free, free]), dtype=np.float64
+    )
     scatter = np.zeros_like(inverse)
     for cluster in np.unique(clusters):
         gradient = equations.gradient(clusters == cluster)

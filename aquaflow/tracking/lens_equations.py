@@ -103,7 +103,7 @@ class LensEquations:
         self._H_pp = 1e-9 + np.bincount(point, weights * np.sum(along**2, axis=1), count)
         self._g_p = np.bincount(point, weights * np.sum(along * error, axis=1), count)
         by_point = np.einsum("mr,mrk->mk", along, self._wJ)
-        self._H_pc = _summed(point[:, None] * width + self._columns, by_point, count * width)
+        self._H_pc = _sum_words(point[:, None] * width + self._columns, by_point, count * width)
         self._H_pc = self._H_pc.reshape(count, width)
         self._by_match = np.einsum("mrk,mr->mk", self._wJ, error)
 
@@ -127,11 +127,11 @@ class LensEquations:
     ) -> Array:
         """[C] of the ``points``, their depths eliminated."""
         rows, width = points[self._observations.point], self._H_pc.shape[1]
-        direct = _summed(self._columns[rows], self._by_match[rows], width)
+        direct = _sum_words(self._columns[rows], self._by_match[rows], width)
         gain = self._g_p[points] / self._H_pp[points]
         return np.asarray(direct - gain @ self._H_pc[points])
 
-    def held(
+    def hold_gauge(
         self,
         H: Array,  # [C, C]
     ) -> Array:
@@ -140,13 +140,13 @@ class LensEquations:
         extra[-TERMS:] += LENS_PRIOR_SIGMA**-2.0
         return H + np.diag(extra)
 
-    def stepped(self, damping: float, terms: int) -> LensUnknowns:
+    def step(self, damping: float, terms: int) -> LensUnknowns:
         """The state after a damped step in which only the first ``terms`` of the lens move."""
         state = self._state
         H, gradient = self.hessian, self.gradient(np.ones(len(state.rho), dtype=bool))
         gradient[-TERMS:] += state.lens / LENS_PRIOR_SIGMA**2
         free = slice(0, len(H) - TERMS + terms)
-        A = self.held(H) + damping * np.diag(np.diag(H))
+        A = self.hold_gauge(H) + damping * np.diag(np.diag(H))
         step = np.zeros(len(H))
         step[free] = -np.linalg.solve(A[free, free], gradient[free])
         moves = step[:-TERMS].reshape(-1, 6)
@@ -163,7 +163,7 @@ def _columns(observations: LensObservations, views: int) -> Indices:
     return np.concatenate([*blocks, lens], axis=1)
 
 
-def _summed(
+def _sum_words(
     where: Indices,  # [...] below size
     values: Array,  # [...]
     size: int,
@@ -172,7 +172,7 @@ def _summed(
     return np.asarray(np.bincount(where.ravel(), values.ravel(), size), dtype=np.float64)
 
 
-def _transformed(
+def _transform(
     observations: LensObservations, state: LensUnknowns
 ) -> tuple[Array, Array, Array, Array]:
     """Of every match: its point's ray [M, 3], rotation into the view [M, 3, 3], the way between
@@ -183,20 +183,20 @@ def _transformed(
     rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)[point]
     R_cw = np.swapaxes(state.R_wc, 1, 2)[view]
     R = R_cw @ state.R_wc[reference]
-    way = _applied(R_cw, state.centres[reference] - state.centres[view])
-    return rays, R, way, _applied(R, rays) + state.rho[point, None] * way
+    way = _apply(R_cw, state.centres[reference] - state.centres[view])
+    return rays, R, way, _apply(R, rays) + state.rho[point, None] * way
 
 
 def residuals(observations: LensObservations, state: LensUnknowns) -> Array:
     """[M, 2] of the normalised plane as it was seen."""
-    Y = _transformed(observations, state)[-1]
+    Y = _transform(observations, state)[-1]
     return seen_at(Y[:, :2] / np.maximum(Y[:, 2:], MIN_Z), state.lens) - observations.matches
 
 
 def _derivatives(observations: LensObservations, state: LensUnknowns) -> tuple[Array, Array, Array]:
     """Residuals [M, 2], their derivatives [M, 2, 12 + TERMS] by the columns of ``_columns``, and
     [M, 2] by rho."""
-    rays, R, way, Y = _transformed(observations, state)
+    rays, R, way, Y = _transform(observations, state)
     z = np.maximum(Y[:, 2], MIN_Z)
     at = Y[:, :2] / z[:, None]
     project = np.zeros((len(at), 2, 3))
@@ -209,13 +209,13 @@ def _derivatives(observations: LensObservations, state: LensUnknowns) -> tuple[A
     by_errors = by_lens(at, state.lens) - D @ R[:, :, :2] @ bent
     parts = [by_centre, -D @ R @ hat(rays), -by_centre, D @ hat(Y), by_errors]
     error = seen_at(at, state.lens) - observations.matches
-    return error, np.concatenate(parts, axis=2), _applied(D, way)
+    return error, np.concatenate(parts, axis=2), _apply(D, way)
 
 
-def triangulated(observations: LensObservations, state: LensUnknowns) -> Array:
+def triangulate(observations: LensObservations, state: LensUnknowns) -> Array:
     """[P] inverse depths, linear least squares."""
-    rays, R, way, _ = _transformed(observations, state)
-    at_infinity, match = _applied(R, rays), rays_of(observations.matches, state.lens)
+    rays, R, way, _ = _transform(observations, state)
+    at_infinity, match = _apply(R, rays), rays_of(observations.matches, state.lens)
     slope = way[:, :2] - match * way[:, 2:]
     value = match * at_infinity[:, 2:] - at_infinity[:, :2]
     count, point = len(state.rho), observations.point
@@ -223,7 +223,7 @@ def triangulated(observations: LensObservations, state: LensUnknowns) -> Array:
     return np.asarray(top / np.maximum(np.bincount(point, np.sum(slope**2, axis=1), count), 1e-18))
 
 
-def _applied(
+def _apply(
     R: Array,  # [M, r, 3]
     vectors: Array,  # [M, 3]
 ) -> Array:

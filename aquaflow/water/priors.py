@@ -39,16 +39,16 @@ def beliefs(
     found: list[Belief] = []
     for c in range(3):
         if config.dark_channel:
-            found.append(_ranked(J, c, DARK_SHARE, DARK_LEVEL, DARK_SIGMA))
+            found.append(_rank(J, c, DARK_SHARE, DARK_LEVEL, DARK_SIGMA))
         if config.saturation:
-            bright = _ranked(J, c, 1.0 - BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA)
+            bright = _rank(J, c, 1.0 - BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA)
             found += [bright] if bright.residual > 0.0 else []
         if config.grey_world:
             found.append(_grey(J, c))
     return found
 
 
-def _ranked(
+def _rank(
     J: Array,  # [3, P]
     c: int,
     share: float,

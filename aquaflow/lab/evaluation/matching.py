@@ -45,15 +45,15 @@ class Distortion:
     """1/px"""
 
     @classmethod
-    def scaled(cls, name: str, by: float) -> Distortion:
+    def scale(cls, name: str, by: float) -> Distortion:
         """``by`` times the medium level."""
         return cls(name, 20.0 * by, (45.0 * by, 35.0 * by), 0.2 * by, 4e-4 * by)
 
 
 LEVELS = (
-    Distortion.scaled("mild", 0.3),
-    Distortion.scaled("medium", 1.0),
-    Distortion.scaled("hard", 1.6),
+    Distortion.scale("mild", 0.3),
+    Distortion.scale("medium", 1.0),
+    Distortion.scale("hard", 1.6),
 )
 """Easy to hard; shares of the same largest motion."""
 

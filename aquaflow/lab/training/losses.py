@@ -96,7 +96,7 @@ def match_loss(
     rows, columns = nearest_pixels(found.pixels, pair.b)
     losses = []
     for item in range(len(rows)):
-        places = _drawn(found.visible[item], weights.matches, generator)
+        places = _draw(found.visible[item], weights.matches, generator)
         if len(places) < 2:  # nothing to distinguish
             continue
         v, u = places.unbind(1)
@@ -128,7 +128,7 @@ def info_nce(
     return (trust * (both[0] + both[1]) / 2 - alpha * trust.log()).mean()
 
 
-def _drawn(
+def _draw(
     visible: Tensor,  # [H, W] bool
     count: int,
     generator: torch.Generator,

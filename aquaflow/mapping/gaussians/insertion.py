@@ -43,8 +43,8 @@ class TrackedRange:
 
 def tracked_range(pointmap: Pointmap, known_sigma: float) -> TrackedRange:
     """Known where the relative standard deviation is below ``known_sigma``; on the host."""
-    camera, pointmap = pointmap.camera, pointmap.completed(known_sigma)
-    known = torch.from_numpy(pointmap.known(known_sigma))
+    camera, pointmap = pointmap.camera, pointmap.complete(known_sigma)
+    known = torch.from_numpy(pointmap.is_known(known_sigma))
     length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
     depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
     Q = torch.from_numpy(pointmap.Q)

@@ -53,7 +53,7 @@ def surface_ratio(field: HeightField) -> Quantity:
         each = [s * (2.0 + g2) / (1.0 + g2) ** 1.5 for g2 in squares]
         return float(np.nanmean(np.mean(each, axis=0)))
 
-    return _corrected(field, mean, bias)
+    return _correct(field, mean, bias)
 
 
 def chain_ratio(field: HeightField) -> Quantity:
@@ -83,7 +83,7 @@ def chain_ratio(field: HeightField) -> Quantity:
         each = [(noise / (1.0 + p**2) ** 1.5).ravel() for noise, p in links]
         return float(np.nanmean(np.concatenate(each)))
 
-    return _corrected(field, mean, bias)
+    return _correct(field, mean, bias)
 
 
 def slope(field: HeightField, percent: float, tilt_sigma_rad: float) -> Quantity:
@@ -136,7 +136,7 @@ def relief(field: HeightField, tilt_sigma_rad: float, scale_sigma: float, unit: 
     return _between(plain + lost, half, half, unit, 0.0)
 
 
-def _corrected(
+def _correct(
     field: HeightField, of: Callable[[Array], float], noise: Callable[[], float]
 ) -> Quantity:
     """A ratio of the heights, less what noise adds, with what the resolution took."""

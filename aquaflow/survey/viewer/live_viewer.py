@@ -104,9 +104,9 @@ class LiveViewer(DiveView):
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            from aquaflow.mapping.map_copy import copied  # torch, which has made the map
+            from aquaflow.mapping.map_copy import copy_map  # torch, which has made the map
 
-            self._copies.put((sub_map, copied(mapper)))
+            self._copies.put((sub_map, copy_map(mapper)))
 
     def _show(self) -> None:
         pose = self._poses.take(LOOK_S)
@@ -124,7 +124,7 @@ class LiveViewer(DiveView):
         if taken is not None:
             sub_map, copy = taken
             plan = self._plan(sub_map) if self._plan is not None and self._page.watched else None
-            self._page.show_splats(*shown(copy, self._config.splats, frame, plan))
+            self._page.show_splats(*pack_for_browser(copy, self._config.splats, frame, plan))
         self._page.show_health(in_words(report))
 
 
@@ -232,7 +232,7 @@ class ViewerPose:
     """[H, W, 3] RGB"""
 
 
-def shown(
+def pack_for_browser(
     copy: MapCopy, budget: int, frame: LengthUnit | None = None, plan: CoveragePlan | None = None
 ) -> tuple[ViewerSplats, SeenWater | None, dict[str, Palette]]:
     """In the viewer's thread: what a browser gets, the water before it, and the palettes of what

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, projected
+from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, project
 from aquaflow.tracking.adjustment.robust import huber_cost
 
 REFINEMENTS = 2
@@ -22,7 +22,7 @@ def held_out_errors(matches: Sequence[AnchorMatches], poses: Sim3Batch) -> list[
     """[V, P] lengths of the errors in sigmas of every anchor; NaN where nothing is seen."""
     errors = []
     for anchor in matches:
-        error = projected(anchor, poses, triangulated(anchor, poses)).error
+        error = project(anchor, poses, triangulate(anchor, poses)).error
         size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
         errors.append(np.where(anchor.used, size, np.nan))
     return errors
@@ -64,16 +64,16 @@ def verdict(
     )
 
 
-def triangulated(matches: AnchorMatches, poses: Sim3Batch) -> Array:
+def triangulate(matches: AnchorMatches, poses: Sim3Batch) -> Array:
     """[P] inverse depths that fit the matches best, whatever the pointmap says; 0 at infinity."""
-    at = projected(matches, poses, np.zeros(len(matches.rays)))
+    at = project(matches, poses, np.zeros(len(matches.rays)))
     weight = np.where(matches.used, 1.0 / matches.sigma[:, None] ** 2, 0.0)
     seen = np.where(matches.used[..., None], matches.at, 0.0)
     way = at.t[:, None, :2] - seen * at.t[:, None, 2:]
     value = seen * at.Y[..., 2:] - at.Y[..., :2]
     rho = _ratio((weight * (way * value).sum(-1)).sum(0), (weight * (way**2).sum(-1)).sum(0))
     for _ in range(REFINEMENTS):
-        at = projected(matches, poses, rho)
+        at = project(matches, poses, rho)
         slope = at.t[:, None, :2] / at.z[..., None] - at.Y[..., :2] * (
             at.t[:, None, 2:] / (at.z**2)[..., None]
         )

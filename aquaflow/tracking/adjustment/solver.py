@@ -17,7 +17,7 @@ from aquaflow.tracking.adjustment.equations import (
     Array,
     Mask,
     anchor_equations,
-    projected,
+    project,
 )
 from aquaflow.tracking.adjustment.links import Links
 from aquaflow.tracking.adjustment.robust import huber_cost
@@ -48,7 +48,7 @@ def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) 
     """Robust cost of all matches, and of the depths' departure from the pointmaps."""
     total = links.cost(state.poses)
     for anchor, rho in zip(matches, state.rho, strict=True):
-        error = projected(anchor, state.poses, rho).error
+        error = project(anchor, state.poses, rho).error
         size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
         total += float(huber_cost(size).sum())
         total += 0.5 * float(((rho - anchor.rho) ** 2 / anchor.variance).sum())
@@ -67,8 +67,8 @@ def descend(
     pattern, system = None, None
     for _ in range(iterations):
         pattern = pattern or BlockPattern.of(matches, links, free)
-        system = system or linearised(matches, links, state, pattern)
-        candidate = _stepped(matches, state, system, free, damping)
+        system = system or linearise(matches, links, state, pattern)
+        candidate = _step(matches, state, system, free, damping)
         new_cost = np.inf if candidate is None else cost_of(matches, links, candidate)
         if candidate is None or not new_cost < cost:
             damping *= 10.0
@@ -96,7 +96,7 @@ class System:
     their depths step."""
 
 
-def linearised(
+def linearise(
     matches: Sequence[AnchorMatches], links: Links, state: BundleState, pattern: BlockPattern
 ) -> System:
     """The equations of all anchors and links, summed anchor by anchor."""
@@ -113,7 +113,7 @@ def linearised(
     return System(total.matrix(), total.gradient, kept)
 
 
-def _stepped(
+def _step(
     matches: Sequence[AnchorMatches],
     state: BundleState,
     system: System,
@@ -122,7 +122,7 @@ def _stepped(
 ) -> BundleState | None:
     """The state after a damped step; None if the equations have no solution."""
     step = np.zeros((len(state.poses), 7))
-    step[free] = solved(system.H, system.gradient, damping)
+    step[free] = solve(system.H, system.gradient, damping)
     poses = (state.poses @ Sim3Batch.exp(step)).on_group()
     if not (np.isfinite(step).all() and np.isfinite(poses.t).all() and (poses.scale > 0).all()):
         return None
@@ -134,7 +134,7 @@ def _stepped(
     return BundleState(poses, rho)
 
 
-def solved(
+def solve(
     H: sparse.csc_matrix,
     gradient: Array,  # [7 F]
     damping: float,

@@ -60,7 +60,7 @@ def adjust(
     iterations: int = MAX_ITERATIONS,
 ) -> BundleResult:
     """Levenberg-Marquardt with Huber weights; the scale gauge is fixed at median depth 1."""
-    bundle, damping = _normalised(start), 1e-4
+    bundle, damping = _normalise(start), 1e-4
     system = _System(pixels_reference, pixels, observed, solve_focal)
     cost = system.cost(bundle)
     for _ in range(iterations):
@@ -75,16 +75,16 @@ def adjust(
         bundle, cost, damping = candidate, new_cost, max(0.2 * damping, 1e-9)
         if decrease < STOP_RELATIVE_DECREASE:
             break
-    return system.summary(_normalised(bundle))
+    return system.summary(_normalise(bundle))
 
 
-def _normalised(bundle: Bundle) -> Bundle:
+def _normalise(bundle: Bundle) -> Bundle:
     scale = float(np.median(bundle.rho))
     views = [Sim3(T.R, T.t * scale) for T in bundle.T]
     return Bundle(views, bundle.rho / scale, bundle.camera)
 
 
-def measured(
+def is_measured(
     pixels: Array,  # [V, P, 2] px
 ) -> npt.NDArray[np.bool_]:
     """[V, P] matches that are numbers."""
@@ -103,7 +103,7 @@ class _System:
     ) -> None:
         self.pixels_reference, self.pixels = pixels_reference, pixels
         # One match that is no number would cost the whole system.
-        self.observed = observed & measured(pixels)
+        self.observed = observed & is_measured(pixels)
         self.solve_focal = solve_focal
         self._last: tuple[Bundle, tuple[Array, Array, Array]] | None = None
 

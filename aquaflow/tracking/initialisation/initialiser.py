@@ -164,7 +164,7 @@ class Initialiser:
         camera, pixels = self.reference.camera, self._pixels_reference
         hypotheses = Hypotheses(camera, pixels, self.waiting, self._config)
         result = hypotheses.best()
-        explained = 0.0 if result is None else hypotheses.explained(result.bundle)
+        explained = 0.0 if result is None else hypotheses.explained_share(result.bundle)
         trusted = result is not None and self._trustworthy(explained, result)
         little = self.parallax_px < self._enough_px
         if little:
@@ -211,7 +211,7 @@ class Initialiser:
         return np.stack([columns + 0.5, rows + 0.5], -1)
 
 
-def calibrated(camera: CameraModel) -> CameraModel:
+def calibrate(camera: CameraModel) -> CameraModel:
     """The same camera, no longer a guess."""
     return replace(camera, calibrated=True)
 

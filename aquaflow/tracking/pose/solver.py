@@ -86,7 +86,7 @@ def solve_pose(
         step = _damped_step(H, g, damping)
         if step is None:
             return None
-        candidate = _moved(T, step)
+        candidate = _move(T, step)
         new_H, new_g, new_cost = equations.at(candidate)
         still = stop_converged and float(step @ H @ step) < STOP_SIGMAS**2
         if not np.isfinite(new_cost) or new_cost > cost * (1.0 + SLACK):
@@ -98,7 +98,7 @@ def solve_pose(
         damping = max(damping * 0.1, 1e-9)
         if still:
             break
-    return _summary(problem, matches, T, H, *equations.left(T))
+    return _summary(problem, matches, T, H, *equations.linearise_at(T))
 
 
 class RowEquations:
@@ -112,7 +112,7 @@ class RowEquations:
         rows, weights = self._linearise(self._matches, T), self._matches.weights
         return *_normal_equations(rows, weights), _cost(rows.residual, weights)
 
-    def left(self, T: Sim3) -> tuple[Array, Array]:
+    def linearise_at(self, T: Sim3) -> tuple[Array, Array]:
         """Residuals [K, M] at ``T``, and what each match pulls by [n, M]: weighted J' residual."""
         rows = self._linearise(self._matches, T)
         pull = _huber_weights(rows.residual) * rows.residual * self._matches.weights
@@ -127,7 +127,7 @@ def _equations(matches: Matches, residual: PoseResidual) -> RowEquations | Pixel
     return PixelEquations(library, matches, HUBER)
 
 
-def _moved(
+def _move(
     T: Sim3,
     step: Array,  # [6 or 7]
 ) -> Sim3:

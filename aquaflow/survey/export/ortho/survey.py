@@ -17,7 +17,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.survey.export.ortho.colours import Colours
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
 from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
-from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
+from aquaflow.survey.export.ortho.grid import Grid, GridTile, round_to_digits
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
@@ -86,7 +86,7 @@ def export_survey(
     mapper, frame = dive.filled_map(), dive.frame
     ground = ground_of(frame, mapper.views)
     ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
-    side = resolution or rounded(ranges.footprint)
+    side = resolution or round_to_digits(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
     grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
     through = ranges.median_range if water and mapper.medium.active else None
