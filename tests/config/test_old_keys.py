@@ -11,12 +11,15 @@ import pytest
 import yaml
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.config import Config, load_config, parse_config
+from aquaflow.config import Config, MappingConfig, load_config, parse_config
 from aquaflow.config.old_keys import CONSTANTS, GONE
 from aquaflow.config.presets import PRESETS, configured
 from aquaflow.config.service import ServiceConfig
 from aquaflow.config.stage import Stage, stages_of
 from aquaflow.config.vehicle import VehicleConfig, load_any, load_vehicle
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.state import deserialise, serialise
+from aquaflow.render.reference import ReferenceRenderer
 from tests.command_line import Cli
 
 MOST_PUBLIC = 90
@@ -123,6 +126,20 @@ def test_a_key_whose_code_went_is_taken_out_and_the_reason_told(
     load_any(written(tmp_path, yaml.safe_dump(nested(path, True))))
     (record,) = caplog.records
     assert f"'{path}' is no key any more and not used: {GONE[path]}" in record.message
+
+
+def test_a_map_written_with_keys_of_before_is_read(caplog: pytest.LogCaptureFixture) -> None:
+    facts, arrays = serialise(Mapper(MappingConfig(), ReferenceRenderer(), 0))
+    old = {path: value for path, value in CONSTANTS.items() if path.startswith("mapping.")}
+    old |= dict.fromkeys(GONE, False)
+    for path, value in old.items():
+        *stages, key = path.split(".")[1:]
+        below = facts["config"]
+        for stage in stages:
+            below = below[stage]
+        below[key] = value
+    assert deserialise(facts, arrays, ReferenceRenderer()).config == MappingConfig()
+    assert caplog.records == []
 
 
 def test_no_key_of_before_is_a_key_of_today_and_no_preset_sets_one() -> None:
