@@ -11,11 +11,11 @@ import pytest
 import yaml
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.config import Config, MappingConfig, load_config, parse_config
-from aquaflow.config.old_keys import CONSTANTS, GONE
+from aquaflow.config import Config, MappingConfig, load_config
+from aquaflow.config.old_keys import CONSTANTS, GONE, without_old_keys
 from aquaflow.config.presets import PRESETS, configured
 from aquaflow.config.service import ServiceConfig
-from aquaflow.config.stage import Stage, stages_of
+from aquaflow.config.stage import StageConfig, stages_of, validated
 from aquaflow.config.vehicle import VehicleConfig, load_any, load_vehicle
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import deserialise, serialise
@@ -26,7 +26,7 @@ MOST_PUBLIC = 90
 """Keys that a user decides about a dive and its service; equipment is described apart."""
 
 
-def public_keys(model: type[Stage], prefix: str = "") -> Iterator[str]:
+def public_keys(model: type[StageConfig], prefix: str = "") -> Iterator[str]:
     for name, _, below, is_lab in stages_of(model):
         if not is_lab:
             yield from [prefix + name] if below is None else public_keys(below, f"{prefix}{name}.")
@@ -112,7 +112,8 @@ def test_a_setting_that_is_a_constant_now_is_taken_out_and_its_value_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, path: str
 ) -> None:
     caplog.set_level(logging.WARNING)
-    assert parse_config(nested(path, CONSTANTS[path]), "here") == Config()
+    same = without_old_keys(nested(path, CONSTANTS[path]), "here")
+    assert validated(VehicleConfig, same, "here") == VehicleConfig()
     assert caplog.records == []
     load_any(written(tmp_path, yaml.safe_dump(nested(path, -7))))
     (record,) = caplog.records
