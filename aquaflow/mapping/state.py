@@ -18,6 +18,7 @@ from torch import Tensor
 from aquaflow.base.errors import DamagedError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
+from aquaflow.config.old_keys import without_old_keys
 from aquaflow.geometry.arrays import (
     Arrays,
     add_prefix,
@@ -89,7 +90,8 @@ def deserialise(
     Raises:
         KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.
     """
-    mapper = Mapper(MappingConfig.model_validate(facts["config"]), renderer, 0, failures)
+    config = without_old_keys({"mapping": facts["config"]}, "the map")["mapping"]
+    mapper = Mapper(MappingConfig.model_validate(config), renderer, 0, failures)
     scene, gaussians, device = mapper.scene, mapper.gaussians, mapper.device
     for name, width in gaussians.WIDTHS.items():
         values = checkpoint_in(arrays[f"gaussians.{name}"], device)

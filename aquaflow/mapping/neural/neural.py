@@ -30,6 +30,8 @@ OTHER_SIZE = 0.1
 """Relative change of a voxel's size in map units from which on the Gaussians are grouped anew;
 judgement: the unit in metres gets better all the time, and each time the features begin to fit
 other neighbours."""
+FEATURE_RATE = 4e-3
+"""Adam rate of the features of Gaussians and of groups (ARTDECO: 4e-3)."""
 
 
 class NeuralGaussians:
@@ -334,7 +336,7 @@ class FeatureOptimisers:
         name: str,
         features: Tensor,  # [N, F]
     ) -> SelectiveAdam:
-        groups = {name: (features, self.field.config.feature_rate)}
+        groups = {name: (features, FEATURE_RATE)}
         return SelectiveAdam(groups, self._betas, threads=self.field.threads)
 
     def step(self, window: DecodedWindow) -> None:
@@ -363,8 +365,8 @@ class FeatureOptimisers:
     def slow_down(self, factor: float) -> None:
         """Set the learning rates to this share of the configured ones."""
         config = self.field.config
-        self.local.learning_rates["local"] = factor * config.feature_rate
-        self.shared.learning_rates["shared"] = factor * config.feature_rate
+        self.local.learning_rates["local"] = factor * FEATURE_RATE
+        self.shared.learning_rates["shared"] = factor * FEATURE_RATE
         self.weights.rates[0] = factor * config.rate
 
     def renew_shared(self) -> None:

@@ -36,6 +36,9 @@ from aquaflow.types import CameraModel
 if TYPE_CHECKING:
     from aquaflow.mapping.map_copy import MapCopy  # it loads torch
 
+PICTURE_WIDTH_PX = 240
+"""px of the camera's current picture: some kB at each pose."""
+
 
 class LiveViewer(DiveView):
     """Takes new data from the loop and the maps, and shows them from its own thread."""
@@ -95,7 +98,7 @@ class LiveViewer(DiveView):
         self._path.add(latest, dive.dive_run.slam.metric_frame(latest.sub_map))
         kept = dive.dive_run.pictures
         self._pictures = {} if kept is None else kept.paths
-        step = max(1, image.shape[1] // self._config.picture_width)
+        step = max(1, image.shape[1] // PICTURE_WIDTH_PX)
         small = np.ascontiguousarray(image[::step, ::step])
         self._poses.put(ViewerPose(latest.T_wc, latest.frame.camera, small))
 
