@@ -125,7 +125,7 @@ class Initialiser:
 
     @property
     def fading(self) -> bool:
-        """At the rate of the last frame, the next one will have too few sure matches.
+        """Too few sure matches, or at the rate of the last frame the next one will have too few.
 
         Of a camera that moves along its view, the median parallax is small whatever the geometry is
         known to: most of the picture is far, or near the epipole. Where the ground repeats itself,
@@ -134,7 +134,7 @@ class Initialiser:
         if len(self._sure) < 2 or self.parallax_px < RETRY_GROWTH * self._tried_px:
             return False
         before, now = self._sure[-2:]
-        return before > MIN_MATCHES and now**2 < MIN_MATCHES * before
+        return now < MIN_MATCHES or now**2 < MIN_MATCHES * before
 
     @property
     def turned_back(self) -> bool:
