@@ -138,7 +138,7 @@ class BackFill:
 
 
 @dataclass(frozen=True)
-class LookedBack:
+class BackFillResult:
     """A frame of the past that was looked for, and its pose, if one was found."""
 
     fill: BackFill
@@ -162,7 +162,7 @@ class BackFills:
         self._failures, self._worker = failures, worker
         self._left: list[BackFill] = []
         """The frames left for idle time, in processing order."""
-        self._answer: LookedBack | None = None
+        self._answer: BackFillResult | None = None
         """Of the last frame that was looked for."""
 
     def start(self, at: CurrentKeyframe, camera: CameraModel) -> list[Tracked]:
@@ -209,7 +209,7 @@ class BackFills:
             for found in self._worker.ask(STAGE, frame.index, partial(_look_back, fill, frame)):
                 self.take(found)
 
-    def take(self, found: LookedBack) -> None:
+    def take(self, found: BackFillResult) -> None:
         """What was found of a frame; :meth:`step` finishes it."""
         self._answer = found
 
@@ -222,5 +222,5 @@ class BackFills:
         return [tracked for fill in fills for tracked in fill.all(fill.left(waiting), until)]
 
 
-def _look_back(fill: BackFill, frame: Frame) -> LookedBack:
-    return LookedBack(fill, frame, fill.place(frame))
+def _look_back(fill: BackFill, frame: Frame) -> BackFillResult:
+    return BackFillResult(fill, frame, fill.place(frame))
