@@ -16,6 +16,7 @@ from aquaflow.calibration.parameters import CameraUnknowns
 from aquaflow.calibration.views import BoardImage
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import pixels_of_points, rays_of_pixels, virtual_centre
+from aquaflow.optimise.robust import sigma_of_lengths
 
 Array = npt.NDArray[np.float64]
 
@@ -146,7 +147,7 @@ def _refined(
     everything = np.ones(sum(counts), bool)
     values, poses, _ = _solve(views, parameters, parameters.values(), poses, everything)
     left = np.linalg.norm(_residuals(views, parameters.camera(values), poses), axis=1)
-    kept = left < OUTLIER_SIGMAS * max(float(np.median(left)) / 1.1774, 1e-3)
+    kept = left < OUTLIER_SIGMAS * max(sigma_of_lengths(left), 1e-3)
     values, poses, sigma = _solve(views, parameters, values, poses, kept)
     of_lens = np.array([name in {"fx", "fy"} for name in parameters.names])
     sigma = np.hypot(sigma, np.where(of_lens, FOCAL_BIAS * values, 0.0))

@@ -9,10 +9,13 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.optimise.robust import SoftL1, sigma_of
 from aquaflow.water.model import Derivatives, Prediction, WaterModel
 
 Array = npt.NDArray[np.float64]
 
+KERNEL = SoftL1()
+"""Of an observation's error in one channel."""
 MAX_STEPS = 30
 """Limit of Levenberg-Marquardt in one fit."""
 STEPS_AT_ONCE = 5
@@ -68,7 +71,7 @@ class WaterFit:
 
     def spread(self) -> float:
         """Standard deviation of an observation's error, outliers left out."""
-        return float(np.median(np.abs(self.prediction.errors))) / 0.6745
+        return sigma_of(self.prediction.errors)
 
     def repetition(self) -> float:
         """How often the same error is counted: neighbouring points share the light that plays on
@@ -133,7 +136,7 @@ def cost(
     """Soft L1 of the observations' whitened errors and squares of the priors', together."""
     total = float((problem.priors(x)[0] ** 2).sum())
     whitened = now.errors / (noise * problem.seen.error_scale)
-    total += float(2.0 * (np.sqrt(1.0 + whitened**2) - 1.0).sum())
+    total += float(2.0 * KERNEL.cost(whitened).sum())
     return total + float((problem.of_scene(now.J) ** 2).sum())
 
 
@@ -192,4 +195,4 @@ def _of_channel(
 def weights(problem: WaterModel, now: Prediction, noise: float) -> Array:
     """[3, M] of the observations, those of soft L1."""
     sigma = noise * problem.seen.error_scale
-    return np.asarray(1.0 / (sigma**2 * np.sqrt(1.0 + (now.errors / sigma) ** 2)))
+    return np.asarray(KERNEL.weight(now.errors / sigma) / sigma**2)
