@@ -36,8 +36,9 @@ from aquaflow.optimise.robust import Kernel, sigma_of
 Array = npt.NDArray[np.float64]
 State = TypeVar("State")
 
-LEAST_DIAGONAL = 1e-18
-"""Of the largest entry: where a smaller one is rounding, and not a matter of units."""
+LEAST_DIAGONAL = 1e-15
+"""Of the largest entry: a smaller one is rounding, not a matter of units, and taken for as much, so
+that an unknown that nothing measures stays where it is."""
 LEAST_EIGENVALUE = 1e-13
 """Of the largest, in units of the diagonal: below it rounding decides, and nothing is known."""
 TINY = float(np.finfo(np.float64).tiny)
@@ -195,7 +196,7 @@ class NormalEquations:
             return None
         scale = _unit_diagonal(self.H)
         A = self.H * np.outer(scale, scale)
-        A.flat[:: len(A) + 1] += damping
+        A.flat[:: len(A) + 1] = 1.0 + damping
         _, solution, failed = dposv(A.T, -scale * self.gradient, lower=True, overwrite_a=True)
         step: Array = scale * solution
         return None if failed or not np.isfinite(step).all() else step
