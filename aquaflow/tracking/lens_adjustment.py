@@ -18,6 +18,7 @@ from aquaflow.tracking.lens_equations import (
     Indices,
     LensEquations,
     LensObservations,
+    LensUnknowns,
     SelfCalibration,
     Weighting,
     residuals,
