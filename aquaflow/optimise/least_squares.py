@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg.lapack import dposv
 
-from aquaflow.optimise.robust import Kernel, sigma_of
+from aquaflow.optimise.robust import RobustKernel, sigma_of
 
 Array = npt.NDArray[np.float64]
 State = TypeVar("State")
@@ -46,7 +46,7 @@ LEAST_DAMPING = 1e-9
 """Below it a step is Gauss-Newton's, and a factor exists in spite of a gauge."""
 
 
-class Equations(Protocol):
+class Linearisation(Protocol):
     """A problem about one state, to second order."""
 
     @property
@@ -64,7 +64,7 @@ class Equations(Protocol):
 class Problem(Protocol[State]):
     """What is to be minimised."""
 
-    def linearise(self, state: State) -> Equations:
+    def linearise(self, state: State) -> Linearisation:
         """The equations at ``state``. A problem may choose weights, noise or whitening anew here:
         ``cost`` goes by them until the next time."""
 
@@ -109,7 +109,7 @@ class Ending(Enum):
 
 
 @dataclass(frozen=True)
-class Solution(Generic[State]):
+class Minimum(Generic[State]):
     """The best state that a descent found: never worse than its start, ``slack`` aside."""
 
     state: State
@@ -120,7 +120,7 @@ class Solution(Generic[State]):
     iterations: int
 
 
-def minimise(problem: Problem[State], start: State, rules: Rules) -> Solution[State]:
+def minimise(problem: Problem[State], start: State, rules: Rules) -> Minimum[State]:
     """Descend from ``start``. It returns whatever the residuals hold: :class:`Ending` says how."""
     state, cost, damping, equations = start, float("nan"), rules.damping, None
     for iteration in range(rules.iterations):
@@ -128,7 +128,7 @@ def minimise(problem: Problem[State], start: State, rules: Rules) -> Solution[St
             equations = problem.linearise(state)
             cost = equations.cost
             if not np.isfinite(cost):
-                return Solution(state, cost, Ending.NOT_FINITE, damping, iteration)
+                return Minimum(state, cost, Ending.NOT_FINITE, damping, iteration)
         step = equations.solve(damping)
         short, after, trial = False, float("inf"), state
         if step is not None:
@@ -140,15 +140,15 @@ def minimise(problem: Problem[State], start: State, rules: Rules) -> Solution[St
             state, cost, equations = trial, after, None
             damping = max(rules.shrinkage * damping, LEAST_DAMPING)
             if short or flat:
-                return Solution(state, cost, Ending.CONVERGED, damping, iteration + 1)
+                return Minimum(state, cost, Ending.CONVERGED, damping, iteration + 1)
         elif short:
-            return Solution(state, cost, Ending.CONVERGED, damping, iteration + 1)
+            return Minimum(state, cost, Ending.CONVERGED, damping, iteration + 1)
         else:
             damping = rules.growth * max(damping, LEAST_DAMPING)
             if damping > rules.most_damping:
                 ending = Ending.SINGULAR if step is None else Ending.STUCK
-                return Solution(state, cost, ending, damping, iteration + 1)
-    return Solution(state, cost, Ending.EXHAUSTED, damping, rules.iterations)
+                return Minimum(state, cost, ending, damping, iteration + 1)
+    return Minimum(state, cost, Ending.EXHAUSTED, damping, rules.iterations)
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class NormalEquations:
 
 
 @dataclass
-class Measurements:
+class RobustFit:
     """M measurements of n numbers, with noise that nobody states: the median of what is left finds
     it at every linearisation."""
 
@@ -211,7 +211,7 @@ class Measurements:
     """[M] of x [n]: predicted minus measured, in their own unit."""
     jacobian: Callable[[Array], Array]
     """[M, n] derivatives."""
-    kernel: Kernel
+    kernel: RobustKernel
     expected: Array
     """[n] what x was thought to be before."""
     sigma: Array

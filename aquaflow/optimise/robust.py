@@ -29,7 +29,7 @@ TUKEY_95 = 4.685
 """Sigmas beyond which Tukey's biweight counts nothing: 95 % efficient under Gaussian noise."""
 
 
-class Kernel(Protocol):
+class RobustKernel(Protocol):
     """A robust cost of a residual's size, sigmas, and its weight on the square."""
 
     def cost(self, size: Array) -> Array:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from aquaflow.optimise.least_squares import Measurements, Rules, minimise
+from aquaflow.optimise.least_squares import RobustFit, Rules, minimise
 from aquaflow.optimise.robust import Huber
 from aquaflow.telemetry.offset_search import COVERED, OffsetPeak, RateSeries
 from aquaflow.telemetry.turns import Turns, smoothing
@@ -211,7 +211,7 @@ class _Model:
         return np.asarray(self.smooth @ self.body.within(*edges)[0])
 
 
-class _Turning(Measurements):
+class _Turning(RobustFit):
     """With a turn among the numbers, which steps from the left."""
 
     def move(self, x: Array, step: Array) -> Array:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.clocks.wall import JUMP_NS
-from aquaflow.optimise.least_squares import Measurements, Rules, covariance_of, minimise
+from aquaflow.optimise.least_squares import RobustFit, Rules, covariance_of, minimise
 from aquaflow.optimise.robust import Huber
 from aquaflow.types import UtcTime
 
@@ -162,7 +162,7 @@ def _line(source: str, stated: Sequence[UtcTime]) -> UtcClock:
     offset = np.array([(_offset_ns(each) - base_ns) * 1e-9 for each in stated])
     t = np.array([(each.t_ns - first_ns) * 1e-9 for each in stated])
     J = np.column_stack([np.ones(len(t)), t - t.mean()])
-    problem = Measurements(
+    problem = RobustFit(
         residuals=lambda x: J @ x - offset,
         jacobian=lambda x: J,
         kernel=Huber(),

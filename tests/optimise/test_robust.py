@@ -10,7 +10,7 @@ from aquaflow.optimise.robust import (
     MEDIAN_LENGTH,
     Cauchy,
     Huber,
-    Kernel,
+    RobustKernel,
     SoftL1,
     Tukey,
     sigma_of,
@@ -22,21 +22,21 @@ SIZES = np.geomspace(1e-3, 1e3, 500)
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=str)
-def test_a_weight_is_the_costs_derivative_over_the_size(kernel: Kernel) -> None:
+def test_a_weight_is_the_costs_derivative_over_the_size(kernel: RobustKernel) -> None:
     half = 1e-5 * SIZES
     slope = (kernel.cost(SIZES + half) - kernel.cost(SIZES - half)) / (2.0 * half)
     np.testing.assert_allclose(kernel.weight(SIZES), slope / SIZES, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=str)
-def test_small_residuals_cost_half_their_square_and_weigh_one(kernel: Kernel) -> None:
+def test_small_residuals_cost_half_their_square_and_weigh_one(kernel: RobustKernel) -> None:
     small = np.array([0.0, 1e-3])
     np.testing.assert_allclose(kernel.cost(small), 0.5 * small**2, rtol=1e-5)
     np.testing.assert_allclose(kernel.weight(small), 1.0, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=str)
-def test_a_cost_never_falls_and_never_exceeds_half_the_square(kernel: Kernel) -> None:
+def test_a_cost_never_falls_and_never_exceeds_half_the_square(kernel: RobustKernel) -> None:
     cost = kernel.cost(SIZES)
     assert (np.diff(cost) >= 0.0).all()
     assert (cost <= 0.5 * SIZES**2 * (1.0 + 1e-12)).all()
@@ -46,7 +46,7 @@ def test_a_cost_never_falls_and_never_exceeds_half_the_square(kernel: Kernel) ->
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=str)
-def test_a_residual_without_bounds_has_a_finite_weight(kernel: Kernel) -> None:
+def test_a_residual_without_bounds_has_a_finite_weight(kernel: RobustKernel) -> None:
     assert np.isfinite(kernel.weight(np.array([1e150]))).all()
     assert np.isfinite(kernel.cost(np.array([1e150]))).all()
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.optimise.least_squares import Measurements, Rules, covariance_of, minimise
+from aquaflow.optimise.least_squares import RobustFit, Rules, covariance_of, minimise
 from aquaflow.optimise.robust import Tukey
 
 Array = npt.NDArray[np.float64]
@@ -46,7 +46,7 @@ def shift_of(
     line = np.array([start, float(np.median(inverse - start * rho))])
     A = np.stack([np.ones_like(rho), 1.0 / rho], -1)  # divided by rho: errors are relative
     y = inverse / rho
-    problem = Measurements(
+    problem = RobustFit(
         residuals=lambda line: A @ line - y,
         jacobian=lambda line: A,
         kernel=Tukey(),
