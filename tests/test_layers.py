@@ -19,7 +19,7 @@ FLOORS = (
         *("tracking", "telemetry", "mapping", "water", "render", "prior", "keyframes"),
         *("sources", "drivers"),
     },
-    {"base", "config", "geometry", "types"},
+    {"base", "config", "geometry", "optimise", "types"},
 )
 """Top floor first: commands, the three shelves and the simulated devices, the core, its base."""
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
@@ -16,6 +15,8 @@ from aquaflow.calibration.parameters import CameraUnknowns
 from aquaflow.calibration.views import BoardImage
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import pixels_of_points, rays_of_pixels, virtual_centre
+from aquaflow.optimise.least_squares import NormalEquations, Rules, minimise
+from aquaflow.optimise.robust import sigma_of_lengths
 
 Array = npt.NDArray[np.float64]
 
@@ -25,8 +26,8 @@ POSE = 6
 """Numbers of a pose: rotation vector, translation (m)."""
 POSE_STEP = 1e-5
 """rad and m, over which a pose is varied for a derivative: a few thousandths of a pixel."""
-TOLERANCE = 1e-12
-"""Relative change of the cost, or of the numbers, that ends the search."""
+RULES = Rules(iterations=100, sigmas=1e-5, damping=1e-3)
+"""A few iterations from a focal length that is right, some twenty from one that is guessed."""
 FOCAL_BIAS = 1e-3
 """Relative 1 sigma of a focal length that no residual shows: OpenCV's corners of tilted boards lie
 so that focal lengths come out 0.05 to 0.14 % short, measured on rendered boards of both kinds."""
@@ -146,7 +147,7 @@ def _refine(
     everything = np.ones(sum(counts), bool)
     values, poses, _ = _solve(views, parameters, parameters.values(), poses, everything)
     left = np.linalg.norm(_residuals(views, parameters.camera(values), poses), axis=1)
-    kept = left < OUTLIER_SIGMAS * max(float(np.median(left)) / 1.1774, 1e-3)
+    kept = left < OUTLIER_SIGMAS * max(sigma_of_lengths(left), 1e-3)
     values, poses, sigma = _solve(views, parameters, values, poses, kept)
     of_lens = np.array([name in {"fx", "fy"} for name in parameters.names])
     sigma = np.hypot(sigma, np.where(of_lens, FOCAL_BIAS * values, 0.0))
@@ -154,6 +155,88 @@ def _refine(
     ends = np.cumsum(counts)[:-1]
     residuals = np.split(_residuals(views, camera, poses), ends)
     return CalibrationFit(camera, parameters.names, values, sigma, residuals, np.split(kept, ends))
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """N corners in V views as a problem of least squares over the camera's P numbers and V poses.
+
+    A state is [P + 6 V], counted in the steps of its derivatives.
+    """
+
+    views: Sequence[BoardImage]
+    parameters: CameraUnknowns
+    kept: npt.NDArray[np.bool_]
+    """[N] corners to use."""
+
+    @property
+    def scale(self) -> Array:
+        """[P + 6 V] of the steps."""
+        poses = np.full(POSE * len(self.views), POSE_STEP)
+        return np.concatenate([self.parameters.steps, poses])
+
+    @property
+    def rows_of(self) -> npt.NDArray[np.intp]:
+        """[2 N] the view of each row of the residuals."""
+        of_view = np.repeat(
+            np.arange(len(self.views)), [len(view.found.numbers) for view in self.views]
+        )
+        return np.repeat(of_view[self.kept], 2)
+
+    def residuals(
+        self,
+        x: Array,  # [P + 6 V]
+    ) -> Array:
+        """[2 N] px"""
+        values, poses = np.split(x * self.scale, [len(self.parameters.steps)])
+        camera = self.parameters.camera(values)
+        left = _residuals(self.views, camera, poses.reshape(-1, POSE))
+        return np.asarray(left[self.kept].ravel())
+
+    def jacobian(
+        self,
+        x: Array,  # [P + 6 V]
+    ) -> Array:
+        """[2 N, P + 6 V] by central differences."""
+        rows, size = self.rows_of, len(self.parameters.steps)
+        J, unit = np.zeros((len(rows), len(x))), np.eye(size, len(x))
+        for k in range(size):
+            J[:, k] = self._change(x, unit[k])
+        for k in range(POSE):  # no two views share a pose: all are varied at once
+            step = np.zeros(len(x))
+            step[size + k :: POSE] = 1.0
+            J[np.arange(len(J)), size + POSE * rows + k] = self._change(x, step)
+        return J
+
+    def linearise(
+        self,
+        x: Array,  # [P + 6 V]
+    ) -> NormalEquations:
+        """The equations of a step [P + 6 V]."""
+        return NormalEquations.of(self.jacobian(x), self.residuals(x))
+
+    def cost(
+        self,
+        x: Array,  # [P + 6 V]
+    ) -> float:
+        """Half the sum of squares, px."""
+        r = self.residuals(x)
+        return 0.5 * float(r @ r)
+
+    def move(
+        self,
+        x: Array,  # [P + 6 V]
+        step: Array,  # [P + 6 V]
+    ) -> Array:
+        """Their sum."""
+        return x + step
+
+    def _change(
+        self,
+        x: Array,  # [P + 6 V]
+        step: Array,  # [P + 6 V]
+    ) -> Array:
+        return np.asarray(0.5 * (self.residuals(x + step) - self.residuals(x - step)))
 
 
 def _solve(
@@ -164,39 +247,14 @@ def _solve(
     kept: npt.NDArray[np.bool_],  # [N] corners to use
 ) -> tuple[Array, Array, Array]:
     """Values [P], poses [V, 6] and the sigma [P] of the values."""
-    size = len(values)
-    scale = np.concatenate([parameters.steps, np.full(poses.size, POSE_STEP)])
-    of_view = np.repeat(np.arange(len(views)), [len(view.found.numbers) for view in views])
-    rows = np.repeat(of_view[kept], 2)
-
-    def residuals(x: Array) -> Array:
-        """[2 N] px; ``x`` is counted in steps."""
-        values, poses = np.split(x * scale, [size])
-        left = _residuals(views, parameters.camera(values), poses.reshape(-1, POSE))
-        return np.asarray(left[kept].ravel())
-
-    def change(x: Array, step: Array) -> Array:
-        return np.asarray(0.5 * (residuals(x + step) - residuals(x - step)))
-
-    def jacobian(x: Array) -> Array:
-        """[2 N, P + 6 V]"""
-        J, unit = np.zeros((len(rows), len(x))), np.eye(size, len(x))
-        for k in range(size):
-            J[:, k] = change(x, unit[k])
-        for k in range(POSE):  # no two views share a pose: all are varied at once
-            step = np.zeros(len(x))
-            step[size + k :: POSE] = 1.0
-            J[np.arange(len(J)), size + POSE * rows + k] = change(x, step)
-        return J
-
-    start = np.concatenate([values, poses.ravel()]) / scale
-    found = least_squares(
-        residuals, start, jac=jacobian, x_scale="jac", ftol=TOLERANCE, xtol=TOLERANCE, gtol=None
-    )
+    problem, size = _Corners(views, parameters, kept), len(values)
+    start = np.concatenate([values, poses.ravel()]) / problem.scale
+    found = minimise(problem, start, RULES).state
+    rows = problem.rows_of
     views_of = [np.flatnonzero(rows == k) for k in range(len(views))]
-    sigma = _sigma(jacobian(found.x), residuals(found.x), size, views_of) * scale[:size]
-    best = found.x * scale
-    return best[:size], best[size:].reshape(-1, POSE), sigma
+    sigma = _sigma(problem.jacobian(found), problem.residuals(found), size, views_of)
+    best = found * problem.scale
+    return best[:size], best[size:].reshape(-1, POSE), sigma * problem.scale[:size]
 
 
 def _sigma(

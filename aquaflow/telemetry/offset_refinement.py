@@ -15,7 +15,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from aquaflow.geometry.robust import MAD_TO_SIGMA
+from aquaflow.optimise.least_squares import RobustFit, Rules, minimise
+from aquaflow.optimise.robust import Huber
 from aquaflow.telemetry.offset_search import COVERED, OffsetPeak, RateSeries
 from aquaflow.telemetry.turns import Turns, smoothing
 
@@ -39,10 +40,8 @@ PARAMETERS = 9
 OWN_INTERVALS = 1.0
 """Smoothing of the body's turns, in intervals of its log, before they are interpolated: the noise
 of interpolated samples depends on where between two of them one looks, and draws the offset."""
-HUBER = 1.345
-"""Residuals beyond so many sigma count linearly: 95 % efficient where the noise is Gaussian."""
-ITERATIONS = 12
-"""Of Gauss-Newton; the search starts it within 0.025 s, where 5 are enough."""
+RULES = Rules(iterations=12, sigmas=1e-3, damping=0.0)
+"""Of the fit; the search starts it within 0.025 s, where 5 iterations are enough."""
 DERIVATIVE_S = 0.01
 """Half the step of the derivative with respect to time: below the interval of any gyro's log."""
 LONGEST_CORRELATION_S = 2.0
@@ -103,8 +102,9 @@ class Refinement:
         self._smooth, _ = smoothing(camera, self.at_s, np.sqrt(sigma_s**2 - own_s**2))
         self._camera, self._body = camera, RateSeries.of(body, own_s, 0.5 * own_s).turns()
         turn = MOUNTING_SIGMA_RAD if mounting_known else FREE_SIGMA
-        sigmas = [FREE_SIGMA, DRIFT_SIGMA, *[turn] * 3, *[BIAS_SIGMA_RAD_S] * 3, LOG_SCALE_SIGMA]
-        self._prior = np.diag(1.0 / np.square(sigmas))
+        self._sigmas = np.array(
+            [FREE_SIGMA, DRIFT_SIGMA, *[turn] * 3, *[BIAS_SIGMA_RAD_S] * 3, LOG_SCALE_SIGMA]
+        )
 
     def fit(self, peak: OffsetPeak) -> OffsetFit | None:
         """The optimum near ``peak``; None where too little is measured there."""
@@ -114,28 +114,27 @@ class Refinement:
         smooth = csr_array(self._smooth[np.flatnonzero(used)])
         at_s, seen = self.at_s[used], self._seen[used]
         middle_s = float(at_s.mean()) - peak.offset_s
-        x, R_cb = np.zeros(PARAMETERS), peak.R_cb
-        x[OFFSET] = peak.offset_s
-        for _ in range(ITERATIONS):
-            residual, J = self._linearise(x, R_cb, middle_s, smooth, at_s, seen)
-            sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-9)
-            weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(residual), 1e-12))
-            H = np.einsum("gip,gi,giq->pq", J, weight, J) / sigma**2 + self._prior
-            pull = np.einsum("gip,gi->p", J, weight * residual) / sigma**2
-            expected = np.zeros(PARAMETERS)
-            expected[OFFSET] = peak.offset_s
-            step = np.linalg.solve(H, pull - self._prior @ (x - expected))
-            R_cb = Rotation.from_rotvec(step[TURN]).as_matrix() @ R_cb
-            x = x + step
-            x[TURN] = Rotation.from_matrix(R_cb @ peak.R_cb.T).as_rotvec()
+        model = _Model(self._camera, self._body, smooth, at_s, seen, middle_s, peak.R_cb)
+        start = np.zeros(PARAMETERS)
+        start[OFFSET] = peak.offset_s
+        problem = _Turning(
+            model.residuals, model.jacobian, Huber(), start, self._sigmas, least_noise=1e-9
+        )
+        x = minimise(problem, start, RULES).state
+        problem.linearise(x)
+        sigma = problem.noise
+        residual = -model.residuals(x).reshape(-1, 3)
+        J = model.jacobian(x).reshape(-1, 3, PARAMETERS)
+        weight = problem.kernel.weight(np.abs(residual) / sigma)
         J_seen = J.copy()
         J_seen[:, :, OFFSET] = -self._change[used]
         J_seen[:, :, DRIFT] = J_seen[:, :, OFFSET] * (at_s - x[OFFSET] - middle_s)[:, None]
-        H = np.einsum("gip,gi,giq->pq", J, weight, J_seen) / sigma**2 + self._prior
-        covariance = covariance_of(J, weight * residual, H, self._prior, sigma, used, self._step_s)
+        prior = np.diag(self._sigmas**-2.0)
+        H = np.einsum("gip,gi,giq->pq", J, weight, J_seen) / sigma**2 + prior
+        covariance = sandwich_of(J, weight * residual, H, prior, sigma, used, self._step_s)
         whole = np.zeros((len(used), 3))
         whole[used] = residual
-        return OffsetFit(x, covariance, R_cb, middle_s, used, whole, self._seen)
+        return OffsetFit(x, covariance, model.R_cb(x), middle_s, used, whole, self._seen)
 
     def _used_points(self, offset_s: float) -> Mask:
         """[G] grid points whose surroundings were measured by both."""
@@ -145,38 +144,85 @@ class Refinement:
         both = self._smooth @ (length * (covered >= 1.0 - 1e-6))
         return np.asarray((both >= 1.0 - 1e-6) & (self._covered >= COVERED))
 
-    def _linearise(
+
+@dataclass(frozen=True)
+class _Model:
+    """The camera's rates as the body's predict them, about one peak of the search."""
+
+    camera: Turns
+    body: Turns
+    smooth: csr_array
+    """[U, intervals of the camera]"""
+    at_s: Array
+    """[U] points of the grid at which both were measured."""
+    seen: Array
+    """[U, 3] rad/s"""
+    middle_s: float
+    R_start: Array
+    """[3, 3] body to camera, from which the turn of ``x`` counts."""
+
+    def R_cb(
         self,
         x: Array,  # [9]
-        R_cb: Array,  # [3, 3]
-        middle_s: float,
-        smooth: csr_array,
-        at_s: Array,  # [U]
-        seen: Array,  # [U, 3]
-    ) -> tuple[Array, Array]:
-        """Residual [U, 3] rad/s and the derivative [U, 3, 9] of the prediction."""
+    ) -> Array:
+        """[3, 3] body to camera."""
+        return np.asarray(Rotation.from_rotvec(x[TURN]).as_matrix() @ self.R_start)
 
-        def body_rate(offset_s: float) -> Array:
-            edges = (
-                middle_s + (t - offset_s - middle_s) / (1.0 + x[DRIFT])
-                for t in (self._camera.start_s, self._camera.end_s)
-            )
-            return np.asarray(smooth @ self._body.within(*edges)[0])
+    def residuals(
+        self,
+        x: Array,  # [9]
+    ) -> Array:
+        """[3 U] rad/s, predicted less seen."""
+        return (self._predicted(x) - self.seen).ravel()
 
-        M = np.exp(x[LOG_SCALE]) * R_cb
-        predicted = (body_rate(x[OFFSET]) - x[BIAS]) @ M.T
-        later = body_rate(x[OFFSET] + DERIVATIVE_S)
-        earlier = body_rate(x[OFFSET] - DERIVATIVE_S)
-        J = np.empty((len(seen), 3, PARAMETERS))
+    def jacobian(
+        self,
+        x: Array,  # [9]
+    ) -> Array:
+        """[3 U, 9]"""
+        M, predicted = np.exp(x[LOG_SCALE]) * self.R_cb(x), self._predicted(x)
+        later, earlier = (self._body_rate(x, sign * DERIVATIVE_S) for sign in (1.0, -1.0))
+        J = np.empty((len(self.seen), 3, PARAMETERS))
         J[:, :, OFFSET] = (later - earlier) @ M.T / (2.0 * DERIVATIVE_S)
-        J[:, :, DRIFT] = J[:, :, OFFSET] * (at_s - x[OFFSET] - middle_s)[:, None]
+        J[:, :, DRIFT] = J[:, :, OFFSET] * (self.at_s - x[OFFSET] - self.middle_s)[:, None]
         J[:, :, TURN] = np.cross(np.eye(3), predicted[:, None, :]).transpose(0, 2, 1)
         J[:, :, BIAS] = -M
         J[:, :, LOG_SCALE] = predicted
-        return seen - predicted, J
+        return J.reshape(-1, PARAMETERS)
+
+    def _predicted(
+        self,
+        x: Array,  # [9]
+    ) -> Array:
+        """[U, 3] rad/s in camera axes."""
+        M = np.exp(x[LOG_SCALE]) * self.R_cb(x)
+        return np.asarray((self._body_rate(x) - x[BIAS]) @ M.T)
+
+    def _body_rate(
+        self,
+        x: Array,  # [9]
+        later_s: float = 0.0,
+    ) -> Array:
+        """[U, 3] rad/s in body axes, with the offset moved by ``later_s``."""
+        edges = (
+            self.middle_s + (t - x[OFFSET] - later_s - self.middle_s) / (1.0 + x[DRIFT])
+            for t in (self.camera.start_s, self.camera.end_s)
+        )
+        return np.asarray(self.smooth @ self.body.within(*edges)[0])
 
 
-def covariance_of(
+class _Turning(RobustFit):
+    """With a turn among the numbers, which steps from the left."""
+
+    def move(self, x: Array, step: Array) -> Array:
+        """x [9] moved by a step [9]."""
+        moved = x + step
+        turned = Rotation.from_rotvec(step[TURN]) * Rotation.from_rotvec(x[TURN])
+        moved[TURN] = turned.as_rotvec()
+        return moved
+
+
+def sandwich_of(
     J: Array,  # [U, 3, P]
     score: Array,  # [U, 3] weighted residuals, rad/s
     H: Array,  # [P, P]

@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3, hat
+from aquaflow.optimise.least_squares import covariance_of
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.contradictions import SCALING
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.problem import TelemetryProblem
-from aquaflow.telemetry.solve import Solution, inverse_of
+from aquaflow.telemetry.solve import Solution
 from aquaflow.telemetry.state import SCALE, SHIFT, TURN
 from aquaflow.telemetry.world_frame import (
     LARGEST_SCALE_SIGMA,
@@ -128,4 +129,4 @@ def _alone(problem: TelemetryProblem, solution: Solution, factor: Factor) -> flo
     for other, information in zip(problem.factors, solution.information, strict=True):
         if other is factor or other.kind not in SCALING:
             A = A + information
-    return float(np.sqrt(inverse_of(A)[0, 0]))
+    return float(np.sqrt(covariance_of(A)[0, 0]))

@@ -1,8 +1,8 @@
 """The state that all sources together make likeliest, and its covariance.
 
-Gauss-Newton with damping over a few rounds. In the first rounds single samples far from the others
-count less (Cauchy's weights, noise by the median); then those beyond a chi-square gate are left
-out, each source's noise is found from its own residuals, and the rest is generalised least squares.
+A few rounds of least squares. In the first ones single samples far from the others count less
+(Cauchy's weights, noise by the median); then those beyond a chi-square gate are left out, each
+source's noise is found from its own residuals, and the rest is generalised least squares.
 """
 
 from __future__ import annotations
@@ -12,9 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 
-from aquaflow.geometry.robust import MAD_TO_SIGMA
+from aquaflow.optimise.least_squares import (
+    Ending,
+    NormalEquations,
+    Rules,
+    covariance_of,
+    minimise,
+)
+from aquaflow.optimise.robust import Cauchy, sigma_of
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.noise import Noise, likeliest
 from aquaflow.telemetry.state import MetricState, P
@@ -24,12 +31,10 @@ Mask = npt.NDArray[np.bool_]
 
 ROBUST_ROUNDS, ROUNDS = 3, 3
 """Rounds with Cauchy's weights, and with the noise found; more change nothing (measured)."""
-STEPS = 12
-"""Most steps of a round; three or four are usual."""
-SETTLED = 1e-4
-"""Length of a step in sigmas at which a round ends."""
-CAUCHY = 2.4
-"""Sigmas at which Cauchy's weight is a half."""
+RULES = Rules(iterations=12, sigmas=1e-4, damping=1e-9)
+"""Of a round; three or four iterations are usual."""
+KERNEL = Cauchy(2.4)
+"""Of single samples; ``likeliest`` finds the noise of those that the gate leaves."""
 GATE = 4.0
 """Sigmas: of ten thousand normal samples one lies beyond."""
 RELINEARISE = 0.05
@@ -64,30 +69,39 @@ def solve(
     Raises:
         ArithmeticError: the residuals are not finite.
     """
-    state, departed, derivatives = start, np.zeros(P), _Derivatives(factors)
+    found, derivatives = _Estimate(start, np.zeros(P)), _Derivatives(factors)
     kept = tuple(np.ones(len(factor.t_s), dtype=bool) for factor in factors)
     for _ in range(ROBUST_ROUNDS):
-        whitening = [_Robust(factor, factor.residuals(state)) for factor in factors]
-        state, departed, _ = _descend(derivatives, whitening, state, departed, prior)
+        whitening = [_Robust(factor, factor.residuals(found.state)) for factor in factors]
+        found = _descend(derivatives, whitening, found, prior)
     noise: tuple[Noise, ...] = ()
     correlated: list[_Correlated] = []
-    covariance = np.diag(prior**2)
     for _ in range(ROUNDS):
-        residuals = [factor.residuals(state) for factor in factors]
+        residuals = [factor.residuals(found.state) for factor in factors]
         kept = tuple(_gate(f, r) for f, r in zip(factors, residuals, strict=True))
         noise = tuple(
             likeliest(f.t_s[k], r[k], f.sigma[k], f.slow)
             for f, r, k in zip(factors, residuals, kept, strict=True)
         )
         correlated = [_Correlated(*each) for each in zip(factors, kept, noise, strict=True)]
-        state, departed, covariance = _descend(derivatives, correlated, state, departed, prior)
-    if not np.isfinite(covariance).all():
-        raise ArithmeticError("the fusion's covariance is not finite")
+        found = _descend(derivatives, correlated, found, prior)
     information = []
-    for derivative, whiten in zip(derivatives.at(state), correlated, strict=True):
+    for derivative, whiten in zip(derivatives.at(found), correlated, strict=True):
         J = whiten(derivative)
         information.append(J.T @ J)
-    return Solution(state, covariance, kept, noise, tuple(information))
+    covariance = covariance_of(np.diag(prior**-2.0) + np.sum(information, axis=0))
+    if not np.isfinite(covariance).all():
+        raise ArithmeticError("the fusion's covariance is not finite")
+    return Solution(found.state, covariance, kept, noise, tuple(information))
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """A state, and how far it is from the start of all rounds, around which the prior lies."""
+
+    state: MetricState
+    departure: Array
+    """[P] sum of the steps, in the parameters' own units."""
 
 
 class _Derivatives:
@@ -95,18 +109,18 @@ class _Derivatives:
 
     def __init__(self, factors: Sequence[Factor]) -> None:
         self.factors = factors
-        self._found: list[Array] = []
-        self._moved = np.inf
+        self.information: Array = np.zeros((P, P))
+        """[P, P] by which departures are measured."""
+        self._found: list[Array] | None = None
+        self._departure: Array = np.zeros(P)
 
-    def at(self, state: MetricState) -> list[Array]:
+    def at(self, estimate: _Estimate) -> list[Array]:
         """[N, D, P] of each factor."""
-        if self._moved > RELINEARISE:
-            self._found, self._moved = [factor.jacobian(state) for factor in self.factors], 0.0
+        apart = estimate.departure - self._departure
+        if self._found is None or apart @ self.information @ apart > RELINEARISE**2:
+            self._found = [factor.jacobian(estimate.state) for factor in self.factors]
+            self._departure = estimate.departure
         return self._found
-
-    def note_move(self, sigmas: float) -> None:
-        """The state has moved so far."""
-        self._moved += sigmas
 
 
 class _Robust:
@@ -118,8 +132,8 @@ class _Robust:
         r: Array,  # [N, D]
     ) -> None:
         size = np.linalg.norm(r, axis=1) / np.sqrt(r.shape[1])
-        sigma = np.maximum(factor.sigma, MAD_TO_SIGMA * np.median(size) if len(size) else 0.0)
-        self._weights = 1.0 / (sigma * np.sqrt(1.0 + (size / (CAUCHY * sigma)) ** 2))
+        sigma = np.maximum(factor.sigma, sigma_of(size))
+        self._weights = np.sqrt(KERNEL.weight(size / sigma)) / sigma
 
     def __call__(
         self,
@@ -152,64 +166,54 @@ class _Correlated:
         return np.asarray(white.reshape(-1, values.shape[2]))
 
 
+class _Posterior:
+    """The whitened residuals of all factors, and what was known before."""
+
+    def __init__(
+        self,
+        derivatives: _Derivatives,
+        whitening: Sequence[Callable[[Array], Array]],
+        prior: Array,  # [P]
+    ) -> None:
+        self._derivatives, self._whitening, self._prior = derivatives, whitening, prior
+
+    def linearise(self, at: _Estimate) -> NormalEquations:
+        """The equations of a step [P]."""
+        total = NormalEquations.expect(at.departure, self._prior)
+        derivatives, residuals = self._derivatives.at(at), self._residuals(at)
+        for derivative, whiten, r in zip(derivatives, self._whitening, residuals, strict=True):
+            total += NormalEquations.of(whiten(derivative), r)
+        self._derivatives.information = total.H
+        return total
+
+    def cost(self, at: _Estimate) -> float:
+        """Half the sum of all squares, sigmas."""
+        total = float(((at.departure / self._prior) ** 2).sum())
+        return 0.5 * (total + sum(float(r @ r) for r in self._residuals(at)))
+
+    def move(self, at: _Estimate, step: Array) -> _Estimate:
+        """A step [P], shortened as a whole where it turns too far."""
+        step = step * min(1.0, LONGEST_TURN / max(float(np.abs(step[:4]).max()), LONGEST_TURN))
+        return _Estimate(at.state.move(step), at.departure + step)
+
+    def _residuals(self, at: _Estimate) -> list[Array]:
+        factors = self._derivatives.factors
+        return [
+            whiten(factor.residuals(at.state)[..., None])[:, 0]
+            for factor, whiten in zip(factors, self._whitening, strict=True)
+        ]
+
+
 def _descend(
     derivatives: _Derivatives,
     whitening: Sequence[Callable[[Array], Array]],
-    state: MetricState,
-    departed: Array,  # [P] from the start, in the parameters' own units
+    start: _Estimate,
     prior: Array,  # [P]
-) -> tuple[MetricState, Array, Array]:
-    """The state at the least cost, how far it went from the start, and the covariance there."""
-
-    factors = derivatives.factors
-
-    def cost(at: MetricState, away: Array) -> float:
-        parts = (w(f.residuals(at)[..., None]) for f, w in zip(factors, whitening, strict=True))
-        return float(sum((part**2).sum() for part in parts) + ((away / prior) ** 2).sum())
-
-    damping, best = 1e-9, cost(state, departed)
-    if not np.isfinite(best):
+) -> _Estimate:
+    found = minimise(_Posterior(derivatives, whitening, prior), start, RULES)
+    if found.ending in {Ending.NOT_FINITE, Ending.SINGULAR}:
         raise ArithmeticError("the residuals of telemetry are not finite")
-    for _ in range(STEPS):
-        A, b = np.diag(prior**-2.0), -departed / prior**2
-        for factor, derivative, whiten in zip(
-            factors, derivatives.at(state), whitening, strict=True
-        ):
-            J = whiten(derivative)
-            r = whiten(factor.residuals(state)[..., None])[:, 0]
-            A, b = A + J.T @ J, b - J.T @ r
-        step = _step(A, b, damping)
-        step *= min(1.0, LONGEST_TURN / max(float(np.abs(step[:4]).max()), LONGEST_TURN))
-        trial, away = state.move(step), departed + step
-        after = cost(trial, away)
-        if not after <= best * (1.0 + 1e-12):
-            damping = 10.0 * max(damping, 1e-6)
-            continue
-        state, departed, best, damping = trial, away, after, 0.1 * damping
-        length = float(np.sqrt(step @ A @ step))
-        derivatives.note_move(length)
-        if length < SETTLED:
-            break
-    return state, departed, inverse_of(A)
-
-
-def _step(
-    A: Array,  # [P, P] positive definite
-    b: Array,  # [P]
-    damping: float,
-) -> Array:
-    root = 1.0 / np.sqrt(np.diag(A))
-    scaled = A * np.outer(root, root) + damping * np.eye(P)
-    return np.asarray(root * cho_solve((cholesky(scaled, lower=True), True), root * b))
-
-
-def inverse_of(
-    A: Array,  # [P, P] positive definite
-) -> Array:
-    """[P, P] inverse, by way of a unit diagonal: entries differ by many orders of magnitude."""
-    root = 1.0 / np.sqrt(np.diag(A))
-    scaled = cholesky(A * np.outer(root, root), lower=True)
-    return np.asarray(np.outer(root, root) * cho_solve((scaled, True), np.eye(P)))
+    return found.state
 
 
 def _gate(
@@ -225,5 +229,5 @@ def _gate(
     width = min(9, 2 * (len(r) // 2) + 1)
     apart = np.linalg.norm(r - median_filter(r, size=(width, 1), mode="nearest"), axis=1)
     apart /= factor.sigma * np.sqrt(r.shape[1])
-    spread = max(1.0, MAD_TO_SIGMA * float(np.median(apart))) if len(r) else 1.0
+    spread = max(1.0, sigma_of(apart))
     return np.asarray(apart <= GATE * spread)

@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.clocks.wall import JUMP_NS
-from aquaflow.geometry.robust import MAD_TO_SIGMA
+from aquaflow.optimise.least_squares import RobustFit, Rules, covariance_of, minimise
+from aquaflow.optimise.robust import Huber
 from aquaflow.types import UtcTime
 
 Array = npt.NDArray[np.float64]
@@ -58,10 +59,8 @@ LASTING_SAMPLES = 3
 """Samples that make a setting."""
 LASTING_SHARE = 0.05
 """Of a source's samples: a setting kept for less is a damaged message, or one that came late."""
-HUBER = 1.345
-"""Residuals beyond so many sigma count linearly: 95 % efficient where the noise is Gaussian."""
-ITERATIONS = 10
-"""Of the reweighted fit; 4 are enough where one sample in ten is late."""
+RULES = Rules(iterations=20, sigmas=1e-3, damping=0.0)
+"""Of the reweighted fit; 4 iterations are enough where one sample in ten is late."""
 
 
 @dataclass(frozen=True)
@@ -163,15 +162,16 @@ def _line(source: str, stated: Sequence[UtcTime]) -> UtcClock:
     offset = np.array([(_offset_ns(each) - base_ns) * 1e-9 for each in stated])
     t = np.array([(each.t_ns - first_ns) * 1e-9 for each in stated])
     J = np.column_stack([np.ones(len(t)), t - t.mean()])
-    prior = np.diag([0.0, DRIFT_SIGMA**-2])
-    x = np.array([np.median(offset), 0.0])
-    for _ in range(ITERATIONS):
-        residual = offset - J @ x
-        sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), LEAST_SIGMA_S)
-        weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(residual), 1e-12)) / sigma**2
-        H = J.T @ (weight[:, None] * J) + prior
-        x = np.linalg.solve(H, J.T @ (weight * offset))
-    spread = np.linalg.inv(H)
+    problem = RobustFit(
+        residuals=lambda x: J @ x - offset,
+        jacobian=lambda x: J,
+        kernel=Huber(),
+        expected=np.zeros(2),
+        sigma=np.array([np.inf, DRIFT_SIGMA]),
+        least_noise=LEAST_SIGMA_S,
+    )
+    x = minimise(problem, np.array([np.median(offset), 0.0]), RULES).state
+    spread = covariance_of(problem.linearise(x).H)
     return UtcClock(
         middle_ns=first_ns + round(1e9 * float(t.mean())),
         offset_ns=base_ns + round(1e9 * float(x[0])),

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.optimise.robust import sigma_of
 
 Array = npt.NDArray[np.float64]
 
@@ -50,6 +50,6 @@ def depth_ratio(
         return None
     logs = -np.log(X[known, 2] * rho[known])
     middle = float(np.median(logs))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(logs - middle)))
+    spread = sigma_of(logs - middle)
     count = len(logs)
     return DepthRatio(middle, MEDIAN * spread / float(np.sqrt(count)), count)

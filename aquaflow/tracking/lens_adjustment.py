@@ -10,13 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
+from aquaflow.geometry.lens_error import TERMS
+from aquaflow.optimise.least_squares import Rules, minimise
+from aquaflow.optimise.robust import sigma_of_lengths
 from aquaflow.tracking.lens_equations import (
     Array,
     Indices,
     LensEquations,
     LensObservations,
     LensUnknowns,
+    SelfCalibration,
     Weighting,
     residuals,
     triangulate,
@@ -24,17 +27,13 @@ from aquaflow.tracking.lens_equations import (
 
 ROUNDS = 4
 """Of weighting: in the first the lens is held, in the last two outliers are left out."""
-ITERATIONS = 40
-"""Of Levenberg-Marquardt in each round; from a focal length 30 % off it takes about ten."""
-DAMPING_GROWTH = 4.0
-"""After a step that failed; with ten, every other step along the narrow valley in which focal
-length and poses compensate each other fails (measured)."""
-STOP_RELATIVE_DECREASE = 1e-6
-"""Of the cost, some ten thousand: where the lens is badly known, the cost is flat."""
+RULES = Rules(iterations=40, decrease=1e-6, growth=4.0, shrinkage=0.25)
+"""Of each round; from a focal length 30 % off it takes about ten iterations. Where the lens is
+badly known, the cost, some ten thousand, is flat. With damping that changes tenfold, every other
+step along the narrow valley in which focal length and poses compensate each other fails
+(measured)."""
 OUTLIER_SIGMAS = 6.0
 """Mismatches of keypoints lie tens of standard deviations off; the error of a lens does not."""
-MEDIAN_SIGMAS = 1.1774
-"""Median length of a normal error in two dimensions, in standard deviations."""
 MIN_SIGMA = 1e-6
 """Normalised units; noise below a thousandth of a pixel is a test without any."""
 
@@ -76,35 +75,11 @@ def adjust_lens(
         sigma = _sigma(size[ahead])
         used = ahead if number < ROUNDS - 2 else ahead & (size < OUTLIER_SIGMAS * sigma)
         weighting = Weighting(sigma, used)
-        state = _solve(observations, state, weighting, terms if number else 0)
+        problem = SelfCalibration(observations, weighting, terms if number else 0)
+        state = minimise(problem, state, RULES).state
         sigmas.append(_sigma(np.linalg.norm(residuals(observations, state), axis=-1)[used]))
     covariance = _covariance(observations, state, weighting, terms)
     return LensAdjustment(state, covariance, sigmas[0], sigmas[-1])
-
-
-def _solve(
-    observations: LensObservations, state: LensUnknowns, weighting: Weighting, terms: int
-) -> LensUnknowns:
-    """Levenberg-Marquardt with the weighting's scale held."""
-    damping, cost = 1e-4, _cost(observations, state, weighting)
-    equations = LensEquations(observations, state, weighting)
-    for _ in range(ITERATIONS):
-        candidate = equations.step(damping, terms)
-        new_cost = _cost(observations, candidate, weighting)
-        if not np.isfinite(new_cost) or new_cost >= cost:
-            damping *= DAMPING_GROWTH
-            continue
-        decrease = (cost - new_cost) / max(cost, 1e-12)
-        state, cost, damping = candidate, new_cost, max(damping / DAMPING_GROWTH, 1e-9)
-        if decrease < STOP_RELATIVE_DECREASE:
-            break
-        equations = LensEquations(observations, state, weighting)
-    return state
-
-
-def _cost(observations: LensObservations, state: LensUnknowns, weighting: Weighting) -> float:
-    prior = 0.5 * float(np.sum((state.lens / LENS_PRIOR_SIGMA) ** 2))
-    return weighting.cost(residuals(observations, state)) + prior
 
 
 def _covariance(
@@ -113,7 +88,7 @@ def _covariance(
     """[2, 2] of the lens: the sandwich estimator over the clusters of the points."""
     clusters = clusters_of(observations)
     count = len(np.unique(clusters))
-    equations = LensEquations(observations, state, weighting)
+    equations = LensEquations(observations, state, weighting, terms)
     H = equations.hessian
     free = slice(0, len(H) - TERMS + terms)
     inverse: Array = np.asarray(
@@ -121,7 +96,7 @@ def _covariance(
     )
     scatter = np.zeros_like(inverse)
     for cluster in np.unique(clusters):
-        gradient = equations.gradient(clusters == cluster)
+        gradient = equations.gradient_of(clusters == cluster)
         scatter += np.outer(gradient[free], gradient[free]) * count / (count - 1.0)
     lens = slice(len(inverse) - terms, len(inverse) - terms + 2)
     sandwich = (inverse @ scatter @ inverse)[lens, lens]
@@ -157,4 +132,4 @@ def _larger(
 def _sigma(
     size: Array,  # [M] lengths of residuals, normalised plane
 ) -> float:
-    return max(float(np.median(size)) / MEDIAN_SIGMAS, MIN_SIGMA) if len(size) else MIN_SIGMA
+    return max(sigma_of_lengths(size), MIN_SIGMA)

@@ -17,12 +17,14 @@ from aquaflow.geometry.lens_error import (
     slope,
 )
 from aquaflow.geometry.similarity import hat, so3_exp
+from aquaflow.optimise.least_squares import NormalEquations
+from aquaflow.optimise.robust import HUBER_LENGTH, Huber
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-HUBER_SIGMAS = 2.0
-"""Lengths in two dimensions: nine in ten normal errors are shorter."""
+KERNEL = Huber(HUBER_LENGTH)
+"""Of a match, by the length of its error."""
 GAUGE_DAMPING = 1e-9
 """Of the mean diagonal: holds position, attitude and scale of the whole, which nothing measures."""
 MIN_Z = 1e-3
@@ -73,29 +75,30 @@ class Weighting:
         error: Array,  # [M, 2] normalised plane
     ) -> Array:
         """[M] Huber's, over the variance; 0 for what is not used."""
-        size = np.linalg.norm(error, axis=-1)
-        bound = HUBER_SIGMAS * self.sigma
-        huber = np.where(size < bound, 1.0, bound / np.maximum(size, 1e-12))
-        return np.asarray(np.where(self.used, huber / self.sigma**2, 0.0))
+        weight = KERNEL.weight(np.linalg.norm(error, axis=-1) / self.sigma)
+        return np.asarray(np.where(self.used, weight / self.sigma**2, 0.0))
 
     def cost(
         self,
         error: Array,  # [M, 2] normalised plane
+        lens: Array,  # [5]
     ) -> float:
-        """Huber's, of residuals [M, 2]."""
+        """Huber's, of residuals [M, 2], and the prior of the lens."""
         size = np.linalg.norm(error, axis=-1)[self.used] / self.sigma
-        tail = HUBER_SIGMAS * (size - 0.5 * HUBER_SIGMAS)
-        return float(np.where(size < HUBER_SIGMAS, 0.5 * size**2, tail).sum())
+        prior = 0.5 * float(np.sum((lens / LENS_PRIOR_SIGMA) ** 2))
+        return float(KERNEL.cost(size).sum()) + prior
 
 
 class LensEquations:
     """The normal equations at one state: 6 columns a view (centre, rotation), then the lens."""
 
     def __init__(
-        self, observations: LensObservations, state: LensUnknowns, weighting: Weighting
+        self, observations: LensObservations, state: LensUnknowns, weighting: Weighting, terms: int
     ) -> None:
         self._observations, self._state = observations, state
+        self._weighting, self._terms = weighting, terms
         error, J, along = _derivatives(observations, state)
+        self._error = error
         weights, point = weighting.weights(error), observations.point
         self._wJ = weights[:, None, None] * J
         self._J, self._columns = J, _columns(observations, len(state.R_wc))
@@ -121,7 +124,7 @@ class LensEquations:
             H[np.ix_(columns, columns)] += wJ.T @ J
         return np.asarray(H - (self._H_pc / self._H_pp[:, None]).T @ self._H_pc)
 
-    def gradient(
+    def gradient_of(
         self,
         points: npt.NDArray[np.bool_],  # [P] which of them
     ) -> Array:
@@ -140,19 +143,57 @@ class LensEquations:
         extra[-TERMS:] += LENS_PRIOR_SIGMA**-2.0
         return H + np.diag(extra)
 
-    def step(self, damping: float, terms: int) -> LensUnknowns:
-        """The state after a damped step in which only the first ``terms`` of the lens move."""
-        state = self._state
-        H, gradient = self.hessian, self.gradient(np.ones(len(state.rho), dtype=bool))
-        gradient[-TERMS:] += state.lens / LENS_PRIOR_SIGMA**2
-        free = slice(0, len(H) - TERMS + terms)
-        A = self.hold_gauge(H) + damping * np.diag(np.diag(H))
-        step = np.zeros(len(H))
-        step[free] = -np.linalg.solve(A[free, free], gradient[free])
-        moves = step[:-TERMS].reshape(-1, 6)
+    @property
+    def cost(self) -> float:
+        """Robust, the prior of the lens included."""
+        return self._weighting.cost(self._error, self._state.lens)
+
+    @cached_property
+    def gradient(self) -> Array:
+        """[C] of the cost, the depths eliminated; 0 where the lens is held."""
+        gradient = self.gradient_of(np.ones(len(self._state.rho), dtype=bool))
+        gradient[-TERMS:] += self._state.lens / LENS_PRIOR_SIGMA**2
+        gradient[len(gradient) - TERMS + self._terms :] = 0.0
+        return gradient
+
+    def solve(self, damping: float) -> Array | None:
+        """[C] damped step of poses and lens, in which only the free terms of the lens move."""
+        free = slice(0, len(self.gradient) - TERMS + self._terms)
+        H = self.hold_gauge(self.hessian)[free, free]
+        found = NormalEquations(H, self.gradient[free], self.cost).solve(damping)
+        return None if found is None else np.append(found, np.zeros(TERMS - self._terms))
+
+    def move(
+        self,
+        step: Array,  # [C]
+    ) -> LensUnknowns:
+        """The state after a step of poses and lens, and of the depths that fit best then."""
+        state, moves = self._state, step[:-TERMS].reshape(-1, 6)
         R = np.stack([R @ so3_exp(move[3:]) for R, move in zip(state.R_wc, moves, strict=True)])
         rho = state.rho - (self._g_p + self._H_pc @ step) / self._H_pp
         return LensUnknowns(R, state.centres + moves[:, :3], rho, state.lens + step[-TERMS:])
+
+
+class SelfCalibration:
+    """The adjustment as a problem of least squares: the first ``terms`` of the lens are free."""
+
+    def __init__(self, observations: LensObservations, weighting: Weighting, terms: int) -> None:
+        self._observations, self._weighting, self._terms = observations, weighting, terms
+        self._equations: LensEquations | None = None
+
+    def linearise(self, state: LensUnknowns) -> LensEquations:
+        """The equations of a step [C] of poses and lens."""
+        self._equations = LensEquations(self._observations, state, self._weighting, self._terms)
+        return self._equations
+
+    def cost(self, state: LensUnknowns) -> float:
+        """Robust, the prior of the lens included."""
+        return self._weighting.cost(residuals(self._observations, state), state.lens)
+
+    def move(self, state: LensUnknowns, step: Array) -> LensUnknowns:
+        """Poses, depths and lens after a step [C] from where they were linearised last."""
+        assert self._equations is not None
+        return self._equations.move(step)
 
 
 def _columns(observations: LensObservations, views: int) -> Indices:

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.optimise.least_squares import Ending, NormalEquations, Rules, minimise
+from aquaflow.optimise.robust import SoftL1, sigma_of
 from aquaflow.water.model import Derivatives, Prediction, WaterModel
 
 Array = npt.NDArray[np.float64]
 
-MAX_STEPS = 30
-"""Limit of Levenberg-Marquardt in one fit."""
-STEPS_AT_ONCE = 5
-"""Steps between two pauses, each takes 3 to 6 ms."""
+KERNEL = SoftL1()
+"""Of an observation's error in one channel."""
+STEPS_AT_ONCE, MOST_ROUNDS = 5, 10
+"""Iterations between two pauses, each takes 3 to 6 ms; and how often in one fit at most."""
 LEAST_GAIN = 1e-5
 """Relative fall of the cost at which a fit has converged."""
 TINY = 1e-12
 """Guards a division where the observations say nothing at all."""
-DAMPING = 1e-3, 1e6
-"""Levenberg-Marquardt's first damping, and the one at which no step helps any more."""
+FIRST_DAMPING = 1e-3
+"""Relative to the diagonal: rates and colours start far from the minimum."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class WaterFit:
 
     def spread(self) -> float:
         """Standard deviation of an observation's error, outliers left out."""
-        return float(np.median(np.abs(self.prediction.errors))) / 0.6745
+        return sigma_of(self.prediction.errors)
 
     def repetition(self) -> float:
         """How often the same error is counted: neighbouring points share the light that plays on
@@ -99,29 +101,68 @@ def descend(
     x: Array,  # [K] parameters
     noise: float,
 ) -> Generator[None, None, WaterFit]:
-    """Levenberg-Marquardt on the robust cost; pauses every few steps."""
-    damping, give_up = DAMPING
-    problem = problem.expecting(x)
-    weight = weights(problem, problem.predict(x), noise)
-    now = problem.predict(x, weight)
-    for step in range(MAX_STEPS if problem.size else 0):
-        best = before = cost(problem, x, now, noise)
-        H, g = normal_equations(problem, x, now, weight)
-        while damping < give_up:
-            trial = x - np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-            new = problem.predict(trial, weight)
-            found = cost(problem, trial, new, noise)
-            if found < best:
-                x, now, best, damping = trial, new, found, damping / 10.0
-                break
-            damping *= 10.0
-        problem, weight = problem.expecting(x), weights(problem, now, noise)
-        now = problem.predict(x, weight)
-        if step % STEPS_AT_ONCE == 0:
-            yield
-        if before - best < LEAST_GAIN * before:
+    """The parameters of least robust cost; pauses every few iterations."""
+    descent = _Descent(problem, noise)
+    rules = Rules(STEPS_AT_ONCE, decrease=LEAST_GAIN, damping=FIRST_DAMPING)
+    for _ in range(MOST_ROUNDS if problem.size else 0):
+        found = minimise(descent, x, rules)
+        x, rules = found.state, replace(rules, damping=found.damping)
+        yield
+        if found.ending is not Ending.EXHAUSTED:
             break
-    return WaterFit(problem, x, noise, weight)
+    weight = descent.reweigh(x)
+    return WaterFit(descent.problem, x, noise, weight)
+
+
+class _Descent:
+    """The water as a problem of least squares; its priors and weights follow the parameters."""
+
+    def __init__(self, problem: WaterModel, noise: float) -> None:
+        self.problem, self._noise = problem, noise
+        self._weight: Array | None = None
+        self._last: tuple[Array, Prediction] | None = None
+
+    def reweigh(
+        self,
+        x: Array,  # [K]
+    ) -> Array:
+        """[3, M] the weights that go with ``x``; they are taken from now on, as its priors are."""
+        before = self._predict(x)
+        self.problem, self._last = self.problem.expecting(x), None
+        self._weight = weights(self.problem, before, self._noise)
+        return self._weight
+
+    def linearise(
+        self,
+        x: Array,  # [K]
+    ) -> NormalEquations:
+        """The equations of a step [K], by new weights."""
+        weight = self.reweigh(x)
+        H, gradient = normal_equations(self.problem, x, self._predict(x), weight)
+        return NormalEquations(H, gradient, self.cost(x))
+
+    def cost(
+        self,
+        x: Array,  # [K]
+    ) -> float:
+        """Half the robust cost."""
+        return 0.5 * cost(self.problem, x, self._predict(x), self._noise)
+
+    def move(
+        self,
+        x: Array,  # [K]
+        step: Array,  # [K]
+    ) -> Array:
+        """Their sum."""
+        return x + step
+
+    def _predict(
+        self,
+        x: Array,  # [K]
+    ) -> Prediction:
+        if self._last is None or self._last[0] is not x:
+            self._last = x, self.problem.predict(x, self._weight)
+        return self._last[1]
 
 
 def cost(
@@ -133,7 +174,7 @@ def cost(
     """Soft L1 of the observations' whitened errors and squares of the priors', together."""
     total = float((problem.priors(x)[0] ** 2).sum())
     whitened = now.errors / (noise * problem.seen.error_scale)
-    total += float(2.0 * (np.sqrt(1.0 + whitened**2) - 1.0).sum())
+    total += float(2.0 * KERNEL.cost(whitened).sum())
     return total + float((problem.of_scene(now.J) ** 2).sum())
 
 
@@ -192,4 +233,4 @@ def _of_channel(
 def weights(problem: WaterModel, now: Prediction, noise: float) -> Array:
     """[3, M] of the observations, those of soft L1."""
     sigma = noise * problem.seen.error_scale
-    return np.asarray(1.0 / (sigma**2 * np.sqrt(1.0 + (now.errors / sigma) ** 2)))
+    return np.asarray(KERNEL.weight(now.errors / sigma) / sigma**2)

@@ -45,7 +45,7 @@ def _problem(
     )
 
 
-@case("solvers", "tracking.pose.solver._damped_step")
+@case("solvers", "optimise.least_squares.NormalEquations.solve")
 def rank_deficient(check: Check, seed: int) -> None:
     """Matches that are all one match, that lie on one ray, or that weigh nothing."""
     points = _points(seed)
@@ -58,7 +58,7 @@ def rank_deficient(check: Check, seed: int) -> None:
     _finite_or_none(check, weightless)
 
 
-@case("solvers", "tracking.pose.solver._damped_step")
+@case("solvers", "optimise.least_squares.NormalEquations.solve")
 def contradictory_matches(check: Check, seed: int) -> None:
     """Every match points somewhere else."""
     _finite_or_none(check, _problem(_points(seed), _pixels(seed + 1)))

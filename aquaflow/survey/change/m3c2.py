@@ -24,6 +24,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
+from aquaflow.optimise.robust import MAD_TO_SIGMA
 from aquaflow.survey.change.neighbours import CENTRES_AT_ONCE, means_by, pairs_within, parts
 
 Array = npt.NDArray[np.float64]
@@ -38,8 +39,6 @@ says little. The paper asks for 4, and for 20 to 30 where there are as many."""
 LEAST_FACING = 0.3
 """Cosine between a point's normal and a core point's: 73 degrees, so that a face at right angles is
 another one, and the slopes of a rough ground are not."""
-MAD_TO_SIGMA = 1.4826
-"""Of a normal distribution, standard deviation over median absolute deviation."""
 
 
 @dataclass(frozen=True)

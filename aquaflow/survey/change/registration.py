@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.optimise.robust import Tukey, sigma_of
 
 Array = npt.NDArray[np.float64]
 
@@ -26,8 +27,6 @@ STEPS = 40
 """At most; on the synthetic reef it stands still after 10 to 15."""
 STILL = 1e-3
 """Of the resolution: a step that moves points by less is the last."""
-TUKEY = 4.685
-"""Of the weights' cut-off, in sigmas: 95 % efficient for normal residuals."""
 NARROWING = 0.7
 """By which the largest distance of pairs shrinks from step to step, to 3 resolutions."""
 NARROWEST = 3.0
@@ -95,8 +94,8 @@ def register(
                 "first's; give the --transform between their frames, or dives over one place"
             )
         rows = _rows(points[pair.which] - middle, pair.normals)
-        spread = 1.4826 * float(np.median(np.abs(pair.residuals)))
-        weights = _tukey(pair.residuals, max(spread, 1e-9 * resolution))
+        spread = sigma_of(pair.residuals)
+        weights = Tukey().weight(pair.residuals / max(spread, 1e-9 * resolution))
         change = _solve(rows, -pair.residuals, weights)
         T = _about(middle, change) @ T
         done = (
@@ -138,14 +137,6 @@ def _rows(
     """[N, 7] change of the distance along the normals with translation, rotation, log-scale."""
     turned = np.cross(offsets, normals)
     return np.column_stack([normals, turned, (offsets * normals).sum(axis=1)])
-
-
-def _tukey(
-    residuals: Array,  # [N]
-    spread: float,
-) -> Array:
-    inside = np.clip(1.0 - (residuals / (TUKEY * spread)) ** 2, 0.0, None)
-    return np.asarray(inside**2)
 
 
 def _solve(

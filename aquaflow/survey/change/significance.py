@@ -17,12 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import t as student
 
+from aquaflow.optimise.robust import sigma_of
+
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-
-MAD_OF_NORMAL = 0.6745
-"""Median absolute deviation of a normal distribution with sigma 1."""
-
 
 LEAST_SPREAD = 1e-3
 """Of measured scores: the same dive twice has none."""
@@ -36,7 +34,7 @@ def null_spread(
     if len(known) == 0:
         return 0.0, 1.0
     middle = float(np.median(known))
-    spread = float(np.median(np.abs(known - middle))) / MAD_OF_NORMAL
+    spread = sigma_of(known - middle)
     return middle, max(1.0, spread)
 
 
@@ -45,7 +43,7 @@ def measured_spread(
 ) -> float:
     """Spread of the unchanged, less than 1 too: what sigmas that all places share do not add to."""
     known = np.abs(scores[np.isfinite(scores)])
-    spread = float(np.median(known)) / MAD_OF_NORMAL if len(known) else 1.0
+    spread = sigma_of(known) if len(known) else 1.0
     return max(LEAST_SPREAD, spread)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.optimise.robust import sigma_of
 from aquaflow.survey.measure.quantity import NORMAL_95, Quantity
 from aquaflow.survey.measure.scale import Scale
 
@@ -14,8 +15,6 @@ THIRD_DIFFERENCES = 20.0
 """Variance of a third difference over that of one place: 1 + 9 + 9 + 1."""
 LEAST_POSES = 5
 """For two third differences."""
-NORMAL_MEDIAN = 0.6745
-"""Median of a normal distribution's absolute values, in standard deviations."""
 
 
 def way(
@@ -35,7 +34,7 @@ def way(
     longer = 0.0
     if len(places) >= LEAST_POSES:
         third = np.diff(places, 3, axis=0)
-        jitter = np.median(np.abs(third)) / NORMAL_MEDIAN / np.sqrt(THIRD_DIFFERENCES)
+        jitter = sigma_of(third) / np.sqrt(THIRD_DIFFERENCES)
         # Three directions, and both ends of each step: E |d + n|^2 = |d|^2 + 6 sigma^2.
         shorter = np.sqrt(np.maximum(lengths**2 - 6.0 * jitter**2, 0.0))
         longer = float((lengths - shorter).sum())

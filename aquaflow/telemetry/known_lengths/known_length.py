@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.robust import MAD_TO_SIGMA
+from aquaflow.optimise.robust import sigma_of
 
 Array = npt.NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def scale_of(lengths: Sequence[KnownLength]) -> LengthScale | None:
     sigmas = np.array([length.relative_sigma for length in lengths])
     good = np.ones(len(lengths), bool)
     if len(lengths) > 2:
-        spread = max(float(np.median(np.abs(logs - np.median(logs)))) * MAD_TO_SIGMA, 1e-12)
+        spread = max(sigma_of(logs - np.median(logs)), 1e-12)
         allowed = LARGEST_DEVIATION * np.maximum(sigmas, spread)
         good = np.abs(logs - np.median(logs)) <= allowed
     weights = 1.0 / sigmas[good] ** 2

@@ -18,13 +18,15 @@ import numpy.typing as npt
 
 from aquaflow.geometry.similarity import hat
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.adjustment.robust import huber_weights
+from aquaflow.optimise.robust import HUBER_LENGTH, Huber
 
 Array = npt.NDArray[np.float64]
 Float = npt.NDArray[np.float32]
 Index = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
+KERNEL = Huber(HUBER_LENGTH)
+"""Of a match, by the length of its error."""
 MIN_Z = 1e-3
 """Of the depth at the anchor; a point behind a view is projected as if just in front of it."""
 LEAST_CURVATURE = 1e-9
@@ -172,7 +174,7 @@ def _weights(
     """[V, P] inverse variances, Huber's."""
     sigma = matches.sigma[:, None]
     size = np.linalg.norm(error, axis=-1) / sigma
-    return np.asarray(np.where(matches.used, huber_weights(size) / sigma**2, 0.0))
+    return np.asarray(np.where(matches.used, KERNEL.weight(size) / sigma**2, 0.0))
 
 
 def _by_point(at: Projected) -> Array:

@@ -11,8 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, project
-from aquaflow.tracking.adjustment.robust import huber_cost
+from aquaflow.tracking.adjustment.equations import (
+    KERNEL,
+    AnchorMatches,
+    Array,
+    Mask,
+    project,
+)
 
 REFINEMENTS = 2
 """Gauss-Newton steps from the linear solution: the error is then the least there is."""
@@ -51,7 +56,7 @@ def verdict(
         held_out_errors(matches, before), held_out_errors(matches, after), strict=True
     ):
         seen = np.isfinite(old) & np.isfinite(new)
-        cost = [np.where(seen, huber_cost(np.where(seen, each, 0.0)), 0.0) for each in (old, new)]
+        cost = [np.where(seen, KERNEL.cost(np.where(seen, each, 0.0)), 0.0) for each in (old, new)]
         falls.append((cost[0] - cost[1]).sum(0)[seen.any(0)])
         costs += cost[0].sum(), cost[1].sum()
         count += int(seen.sum())

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.optimise.robust import sigma_of_lengths
 from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, project
 from aquaflow.tracking.adjustment.held_out import HeldOutVerdict, only, triangulate, verdict
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.robust import sigma_of
 from aquaflow.tracking.adjustment.solver import BundleState, descend
 from aquaflow.tracking.adjustment.uncertainty import inflation
 
@@ -110,7 +110,7 @@ def _with_noise(
     size = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
     many = matches.used.sum(axis=1) >= FEW
     sigma = np.array([
-        max(sigma_of(row[used]), LEAST_SIGMA) if enough else 1.0
+        max(sigma_of_lengths(row[used]), LEAST_SIGMA) if enough else 1.0
         for row, used, enough in zip(size, matches.used, many, strict=True)
     ])  # fmt: skip
     return replace(matches, sigma=sigma, used=matches.used & many[:, None])

@@ -1,17 +1,19 @@
-"""Levenberg-Marquardt over keyframe poses, and the covariance that it leaves."""
+"""A joint adjustment as a problem of least squares: poses step, and depths follow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.optimise.least_squares import NormalEquations, Rules, minimise
 from aquaflow.tracking.adjustment.block_matrix import BlockPattern
 from aquaflow.tracking.adjustment.equations import (
+    KERNEL,
     AnchorEquations,
     AnchorMatches,
     Array,
@@ -20,13 +22,9 @@ from aquaflow.tracking.adjustment.equations import (
     project,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.robust import huber_cost
 
-FIRST_DAMPING = 1e-4
-"""Relative to the diagonal."""
-LARGEST_DAMPING = 1e6
-STOP_RELATIVE_DECREASE = 1e-4
-"""Of the cost, at which the descent ends."""
+DECREASE = 1e-4
+"""Relative fall of the cost at which a descent ends."""
 DENSE_UNKNOWNS = 700
 """Up to a hundred keyframes a dense factor is quicker than a sparse one."""
 KEPT_BYTES = 64 << 20
@@ -50,7 +48,7 @@ def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) 
     for anchor, rho in zip(matches, state.rho, strict=True):
         error = project(anchor, state.poses, rho).error
         size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
-        total += float(huber_cost(size).sum())
+        total += float(KERNEL.cost(size).sum())
         total += 0.5 * float(((rho - anchor.rho) ** 2 / anchor.variance).sum())
     return total
 
@@ -63,24 +61,44 @@ def descend(
     iterations: int,
 ) -> BundleState:
     """The state of least cost, or the best that ``iterations`` steps find."""
-    damping, cost = FIRST_DAMPING, cost_of(matches, links, state)
-    pattern, system = None, None
-    for _ in range(iterations):
-        pattern = pattern or BlockPattern.of(matches, links, free)
-        system = system or linearise(matches, links, state, pattern)
-        candidate = _step(matches, state, system, free, damping)
-        new_cost = np.inf if candidate is None else cost_of(matches, links, candidate)
-        if candidate is None or not new_cost < cost:
-            damping *= 10.0
-            if damping > LARGEST_DAMPING:
-                break
-            continue
-        decrease = (cost - new_cost) / max(cost, 1e-12)
-        state, cost, system = candidate, new_cost, None
-        damping = max(0.1 * damping, 1e-9)
-        if decrease < STOP_RELATIVE_DECREASE:
-            break
-    return state
+    problem = JointAdjustment(matches, links, free)
+    return minimise(problem, state, Rules(iterations, decrease=DECREASE)).state
+
+
+class JointAdjustment:
+    """Matches and links; F poses are free."""
+
+    def __init__(self, matches: Sequence[AnchorMatches], links: Links, free: Mask) -> None:
+        self._matches, self._links, self._free = matches, links, free
+        self._pattern = BlockPattern.of(matches, links, free)
+        self._system: System | None = None
+        self._known: tuple[BundleState, float] | None = None
+
+    def cost(self, state: BundleState) -> float:
+        """Robust; infinite where a pose is none."""
+        if self._known is None or self._known[0] is not state:
+            poses = state.poses
+            sound = np.isfinite(poses.t).all() and (poses.scale > 0.0).all()
+            cost = cost_of(self._matches, self._links, state) if sound else float("inf")
+            self._known = state, cost
+        return self._known[1]
+
+    def linearise(self, state: BundleState) -> System:
+        """The equations of a step [7 F]."""
+        system = linearise(self._matches, self._links, state, self._pattern)
+        self._system = replace(system, cost=self.cost(state))
+        return self._system
+
+    def move(self, state: BundleState, step: Array) -> BundleState:
+        """Poses moved by a step [7 F], and the depths that fit best then, to first order."""
+        assert self._system is not None
+        whole = np.zeros((len(state.poses), 7))
+        whole[self._free] = step.reshape(-1, 7)
+        rho, parts = [], self._system.parts
+        for i, (anchor, depths) in enumerate(zip(self._matches, state.rho, strict=True)):
+            part = parts[i] if i < len(parts) else anchor_equations(anchor, state.poses, depths)
+            rho.append(depths + part.depth_steps(whole[anchor.places].ravel()))
+        return BundleState((state.poses @ Sim3Batch.exp(whole)).on_group(), rho)
 
 
 @dataclass(frozen=True)
@@ -94,6 +112,21 @@ class System:
     parts: Sequence[AnchorEquations]
     """Of the first anchors, as many as KEPT_BYTES hold: those of the others are made anew when
     their depths step."""
+    cost: float = float("nan")
+
+    def solve(self, damping: float) -> Array | None:
+        """[7 F] damped step of the free poses; None where the equations are singular."""
+        if len(self.gradient) <= DENSE_UNKNOWNS:
+            return NormalEquations(self.H.toarray(), self.gradient, self.cost).solve(damping)
+        diagonal = self.H.diagonal()
+        least = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-12)
+        H = self.H + sparse.diags((damping * diagonal) + least, format="csc")
+        try:
+            factor = splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        except RuntimeError:
+            return None
+        step = np.asarray(-factor.solve(self.gradient))
+        return step if np.isfinite(step).all() else None
 
 
 def linearise(
@@ -111,45 +144,3 @@ def linearise(
     for places, H, gradient in zip(ends, *links.blocks(state.poses), strict=True):
         total.add(places, H, gradient)
     return System(total.matrix(), total.gradient, kept)
-
-
-def _step(
-    matches: Sequence[AnchorMatches],
-    state: BundleState,
-    system: System,
-    free: Mask,  # [K]
-    damping: float,
-) -> BundleState | None:
-    """The state after a damped step; None if the equations have no solution."""
-    step = np.zeros((len(state.poses), 7))
-    step[free] = solve(system.H, system.gradient, damping)
-    poses = (state.poses @ Sim3Batch.exp(step)).on_group()
-    if not (np.isfinite(step).all() and np.isfinite(poses.t).all() and (poses.scale > 0).all()):
-        return None
-    rho = []
-    for i, (anchor, depths) in enumerate(zip(matches, state.rho, strict=True)):
-        kept = i < len(system.parts)
-        part = system.parts[i] if kept else anchor_equations(anchor, state.poses, depths)
-        rho.append(depths + part.depth_steps(step[anchor.places].ravel()))
-    return BundleState(poses, rho)
-
-
-def solve(
-    H: sparse.csc_matrix,
-    gradient: Array,  # [7 F]
-    damping: float,
-) -> Array:
-    """[F, 7] step of the free poses; NaN where the equations are singular."""
-    diagonal = H.diagonal()
-    least = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-12)
-    H = H + sparse.diags((damping * diagonal) + least, format="csc")
-    if len(gradient) <= DENSE_UNKNOWNS:
-        try:
-            return np.asarray(-np.linalg.solve(H.toarray(), gradient)).reshape(-1, 7)
-        except np.linalg.LinAlgError:
-            return np.full((len(gradient) // 7, 7), np.nan)
-    try:
-        factor = splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    except RuntimeError:
-        return np.full((len(gradient) // 7, 7), np.nan)
-    return np.asarray(-factor.solve(gradient)).reshape(-1, 7)

@@ -16,6 +16,8 @@ import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.optimise.least_squares import NormalEquations, Rules, covariance_of, minimise
+from aquaflow.optimise.robust import Huber
 
 Array = npt.NDArray[np.float64]
 
@@ -28,10 +30,10 @@ DRIFT = np.array([0.03, 0.03, 0.03, 0.01, 0.01, 0.01, 0.02])
 clip (docs/benchmarks.md), because the base has drifted too."""
 LARGEST_CHI2 = 24.3
 """Of seven numbers: chance exceeds it once in a thousand times."""
-ROUNDS = 5
-"""Gauss-Newton steps; the links agree, so that three are enough."""
-HUBER = 3.0
-"""Sigmas beyond which a link pulls no harder."""
+RULES = Rules(iterations=10, sigmas=1e-3, damping=0.0)
+"""The links agree, so that three iterations are enough."""
+KERNEL = Huber(3.0)
+"""Of a link's seven numbers together."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +94,54 @@ def fit_sub_map(links: Sequence[BaseLink], poses: Sequence[Sim3]) -> SubMapInBas
     Its covariance is that of the links, more where they scatter more than they state; links of
     neighbouring keyframes count as one half of a measurement each.
     """
-    T_sk, T_mk = Sim3Batch.of([link.T_sk for link in links]), Sim3Batch.of(list(poses))
-    information = 0.5 * np.stack([link.information for link in links])
-    T_sm = Sim3Batch.of([links[-1].T_sk @ poses[-1].inverse()])
-    for _ in range(ROUNDS):
-        at = T_sm @ T_mk
-        residual = (T_sk.inverse() @ at).log()
-        J = at.inverse().adjoint()
-        chi2 = np.einsum("ni,nij,nj->n", residual, information, residual)
-        weight = np.minimum(1.0, HUBER / np.sqrt(np.maximum(chi2, 1e-12)))
-        weighted = weight[:, None, None] * (J.transpose(0, 2, 1) @ information)
-        H = (weighted @ J).sum(axis=0)
-        step = -np.linalg.solve(H, (weighted @ residual[:, :, None]).sum(axis=0)[:, 0])
-        T_sm = (Sim3Batch.exp(step[None]) @ T_sm).on_group()
-    scatter = float((weight * chi2).sum()) / max(7 * (len(links) - 1), 1)
-    return SubMapInBase(T_sm.element(0), np.linalg.inv(H) * max(1.0, scatter))
+    problem = _Placement(
+        Sim3Batch.of([link.T_sk for link in links]),
+        Sim3Batch.of(list(poses)),
+        0.5 * np.stack([link.information for link in links]),
+    )
+    start = Sim3Batch.of([links[-1].T_sk @ poses[-1].inverse()])
+    T_sm = minimise(problem, start, RULES).state
+    size = problem.sizes(problem.residuals(T_sm))
+    scatter = float((KERNEL.weight(size) * size**2).sum()) / max(7 * (len(links) - 1), 1)
+    covariance = covariance_of(problem.linearise(T_sm).H)
+    return SubMapInBase(T_sm.element(0), covariance * max(1.0, scatter))
+
+
+@dataclass(frozen=True)
+class _Placement:
+    """Where a sub-map lies, by N links: a problem of least squares over one similarity."""
+
+    T_sk: Sim3Batch
+    """[N] measured"""
+    T_mk: Sim3Batch
+    """[N]"""
+    information: Array
+    """[N, 7, 7] of the right tangent."""
+
+    def residuals(self, T_sm: Sim3Batch) -> Array:
+        """[N, 7]"""
+        return (self.T_sk.inverse() @ (T_sm @ self.T_mk)).log()
+
+    def sizes(
+        self,
+        residuals: Array,  # [N, 7]
+    ) -> Array:
+        """[N] sigmas"""
+        chi2 = np.einsum("ni,nij,nj->n", residuals, self.information, residuals)
+        return np.asarray(np.sqrt(np.maximum(chi2, 0.0)))
+
+    def linearise(self, T_sm: Sim3Batch) -> NormalEquations:
+        """The equations of a step [7] of the left tangent."""
+        residuals, J = self.residuals(T_sm), (T_sm @ self.T_mk).inverse().adjoint()
+        weight = KERNEL.weight(self.sizes(residuals))[:, None, None]
+        weighted = weight * (J.transpose(0, 2, 1) @ self.information)
+        gradient = (weighted @ residuals[:, :, None]).sum(axis=0)[:, 0]
+        return NormalEquations((weighted @ J).sum(axis=0), gradient, self.cost(T_sm))
+
+    def cost(self, T_sm: Sim3Batch) -> float:
+        """Huber's, of all links."""
+        return float(KERNEL.cost(self.sizes(self.residuals(T_sm))).sum())
+
+    def move(self, T_sm: Sim3Batch, step: Array) -> Sim3Batch:
+        """T_sm [1] after a step [7]."""
+        return (Sim3Batch.exp(step[None]) @ T_sm).on_group()

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from aquaflow.geometry.similarity_batch import Sim3Batch, right_jacobian_inverse
+from aquaflow.optimise.robust import Huber
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -70,11 +71,12 @@ def robust(
 ) -> tuple[Array, Array]:
     """Cost and weight [m] of every edge; the weight is the cost's derivative by chi2."""
     size = np.sqrt(np.maximum(chi2, 1e-300))
-    far = size > huber
-    cost = np.where(far, huber * (2.0 * size - huber), chi2)
-    weight = np.where(far, huber / size, 1.0)
+    kernel = Huber(huber)
     switched = np.where(chi2 <= phi, chi2, phi * (3.0 * chi2 - phi) / (phi + chi2))
-    return np.where(loop, switched, cost), np.where(loop, trust_of(chi2, phi) ** 2, weight)
+    return (
+        np.where(loop, switched, 2.0 * kernel.cost(size)),
+        np.where(loop, trust_of(chi2, phi) ** 2, kernel.weight(size)),
+    )
 
 
 class Misfit:

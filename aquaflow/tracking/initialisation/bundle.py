@@ -13,13 +13,16 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.optimise.least_squares import NormalEquations, Rules, minimise
+from aquaflow.optimise.robust import Huber
 
 Array = npt.NDArray[np.float64]
 
 HUBER_PX = 1.0
 """Reprojection error where the loss turns linear."""
+KERNEL = Huber(HUBER_PX)
 MAX_ITERATIONS = 25
-"""Limit of Levenberg-Marquardt."""
+"""Limit of the descent."""
 STOP_RELATIVE_DECREASE = 1e-4
 """Relative fall of the cost at which the adjustment has converged. With a tenth of it, 24 views of
 Curasao took 20 steps instead of 13 to the same residual; trajectories were no more accurate."""
@@ -59,23 +62,10 @@ def adjust(
     solve_focal: bool = False,
     iterations: int = MAX_ITERATIONS,
 ) -> BundleResult:
-    """Levenberg-Marquardt with Huber weights; the scale gauge is fixed at median depth 1."""
-    bundle, damping = _normalise(start), 1e-4
+    """Least squares with Huber weights; the scale gauge is fixed at median depth 1."""
     system = _System(pixels_reference, pixels, observed, solve_focal)
-    cost = system.cost(bundle)
-    for _ in range(iterations):
-        candidate = system.step(bundle, damping)
-        new_cost = system.cost(candidate)
-        if not np.isfinite(new_cost) or new_cost >= cost:
-            damping *= 10.0
-            if damping > 1e6:
-                break
-            continue
-        decrease = (cost - new_cost) / max(cost, 1e-12)
-        bundle, cost, damping = candidate, new_cost, max(0.2 * damping, 1e-9)
-        if decrease < STOP_RELATIVE_DECREASE:
-            break
-    return system.summary(_normalise(bundle))
+    rules = Rules(iterations, decrease=STOP_RELATIVE_DECREASE, shrinkage=0.2)
+    return system.summary(_normalise(minimise(system, _normalise(start), rules).state))
 
 
 def _normalise(bundle: Bundle) -> Bundle:
@@ -91,8 +81,42 @@ def is_measured(
     return np.asarray(np.isfinite(pixels).all(-1))
 
 
+@dataclass(frozen=True)
+class _Equations:
+    """Of C numbers of the cameras and P inverse depths."""
+
+    H_cc: Array
+    """[C, C]"""
+    H_cp: Array
+    """[C, P]"""
+    H_pp: Array
+    """[P] diagonal"""
+    g_c: Array
+    """[C]"""
+    g_p: Array
+    """[P]"""
+    cost: float
+
+    @property
+    def gradient(self) -> Array:
+        """[C + P]"""
+        return np.concatenate([self.g_c, self.g_p])
+
+    def solve(self, damping: float) -> Array | None:
+        """[C + P] damped step, the depths eliminated."""
+        cc = self.H_cc + damping * np.diag(np.diag(self.H_cc)) + 1e-6 * np.eye(len(self.H_cc))
+        # A matrix times its own transpose is half the work of two.
+        root = 1.0 / np.sqrt(self.H_pp * (1.0 + damping) + 1e-6)
+        H_cp = self.H_cp * root
+        g_c = self.g_c - H_cp @ (root * self.g_p)
+        dc = NormalEquations(cc - H_cp @ H_cp.T, g_c, self.cost).solve(0.0)
+        if dc is None:
+            return None
+        return np.concatenate([dc, -(root * self.g_p + H_cp.T @ dc) * root])
+
+
 class _System:
-    """The normal equations of one problem."""
+    """One problem of least squares."""
 
     def __init__(
         self,
@@ -124,10 +148,9 @@ class _System:
     def cost(self, bundle: Bundle) -> float:
         error, Y, _ = self.residuals(bundle)
         size = np.linalg.norm(error, axis=-1)
-        loss = np.where(size < HUBER_PX, 0.5 * size**2, HUBER_PX * (size - 0.5 * HUBER_PX))
         # A point behind a camera that sees it costs as much as a very bad match.
         wrong = self.observed & (Y[..., 2] < 1e-3)
-        return float(loss.sum() + 10.0 * HUBER_PX * wrong.sum())
+        return float(KERNEL.cost(size).sum() + 10.0 * HUBER_PX * wrong.sum())
 
     def _blocks(self, bundle: Bundle) -> tuple[Array, Array, Array, Array, Array]:
         """H_cc, H_cp, H_pp (diagonal), g_c, g_p for cameras (6 each, then log-focal) and points."""
@@ -136,7 +159,8 @@ class _System:
         size = 6 * views + int(self.solve_focal)
         H_cc, H_cp, H_pp = np.zeros((size, size)), np.zeros((size, count)), np.zeros(count)
         g_c, g_p = np.zeros(size), np.zeros(count)
-        weights = _huber_weight(error) * (self.observed & (Y[..., 2] > 1e-3))
+        lengths = np.linalg.norm(error, axis=-1)
+        weights = KERNEL.weight(lengths) * (self.observed & (Y[..., 2] > 1e-3))
         # View by view, for what belongs to one stays in the processor's cache.
         for v, weight in enumerate(weights):
             Jc, Jp = self._jacobians(bundle, v, Y[v], rays)
@@ -182,16 +206,11 @@ class _System:
             Jc[6] = (P * shrinks[:, None]).sum(0) + np.stack([fx * x, fy * y])
         return Jc, np.tensordot(T.t, P, 1)
 
-    def step(self, bundle: Bundle, damping: float) -> Bundle:
-        H_cc, H_cp, H_pp, g_c, g_p = self._blocks(bundle)
-        pp = H_pp * (1.0 + damping) + 1e-6
-        cc = H_cc + damping * np.diag(np.diag(H_cc)) + 1e-6 * np.eye(len(H_cc))
-        # A matrix times its own transpose is half the work of two.
-        root = 1.0 / np.sqrt(pp)
-        H_cp *= root
-        S = cc - H_cp @ H_cp.T
-        dc = np.asarray(-np.linalg.solve(S, g_c - H_cp @ (root * g_p)), dtype=np.float64)
-        dp = -(root * g_p + H_cp.T @ dc) * root
+    def linearise(self, bundle: Bundle) -> _Equations:
+        return _Equations(*self._blocks(bundle), self.cost(bundle))
+
+    def move(self, bundle: Bundle, step: Array) -> Bundle:
+        dc, dp = np.split(step, [len(step) - len(bundle.rho)])
         views = []
         for v, T in enumerate(bundle.T):
             R = so3_exp(dc[6 * v + 3 : 6 * v + 6])
@@ -213,10 +232,3 @@ class _System:
             focal_sigma = sigma_px * float(np.sqrt(max(variance, 0.0)))
         rho_sigma = sigma_px / np.sqrt(np.maximum(H_pp, 1e-12))
         return BundleResult(bundle, sigma_px, rho_sigma, focal_sigma)
-
-
-def _huber_weight(
-    error: Array,  # [..., 2] px
-) -> Array:
-    size = np.linalg.norm(error, axis=-1)
-    return np.where(size < HUBER_PX, 1.0, HUBER_PX / np.maximum(size, 1e-12))

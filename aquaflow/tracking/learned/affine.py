@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.robust import MAD_TO_SIGMA, biweight
+from aquaflow.optimise.least_squares import RobustFit, Rules, covariance_of, minimise
+from aquaflow.optimise.robust import Tukey
 
 Array = npt.NDArray[np.float64]
 
@@ -26,8 +27,8 @@ large and twice as large as the median's are then 5 and 20 % off."""
 INDEPENDENT = 48
 """Errors of a network that count as independent in a picture (8 x 6 cells), as those of matches
 (tracking/pose/covariance.py)."""
-ITERATIONS = 8
-"""Of reweighting; each divides the remaining error by five or more."""
+RULES = Rules(iterations=12, sigmas=1e-2, damping=0.0)
+"""Of reweighting; each iteration divides the remaining error by five or more."""
 FARTHEST = 50.0
 """Depth over the median depth beyond which nothing is known: there the shift decides all."""
 
@@ -44,15 +45,18 @@ def shift_of(
     start = 1.0 / slope
     line = np.array([start, float(np.median(inverse - start * rho))])
     A = np.stack([np.ones_like(rho), 1.0 / rho], -1)  # divided by rho: errors are relative
-    y, error = inverse / rho, np.inf
-    for _ in range(ITERATIONS):
-        left = y - A @ line
-        sigma = MAD_TO_SIGMA * float(np.median(np.abs(left))) + 1e-9 * start
-        weight = biweight(left, sigma)
-        share = min(INDEPENDENT / len(rho), 1.0)
-        covariance = np.linalg.inv((A.T * weight) @ A + 1e-12 * np.eye(2))
-        line = covariance @ ((A.T * weight) @ y)
-        error = sigma * float(np.sqrt(covariance[1, 1] / share))
+    y = inverse / rho
+    problem = RobustFit(
+        residuals=lambda line: A @ line - y,
+        jacobian=lambda line: A,
+        kernel=Tukey(),
+        expected=line,
+        sigma=np.full(2, np.inf),
+        least_noise=1e-9 * start,
+    )
+    line = minimise(problem, line, RULES).state
+    share = min(INDEPENDENT / len(rho), 1.0)
+    error = float(np.sqrt(covariance_of(problem.linearise(line).H)[1, 1] / share))
     level = line[0] * float(np.median(rho))
     return float(-line[1]) if level > 0.0 and error < MOST_ERROR * level else None
 

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import UNKNOWN_VARIANCE, Pointmap
+from aquaflow.optimise.robust import MAD_TO_SIGMA
 from aquaflow.prior.contract import Float, Mask
 from aquaflow.tracking.learned.scaling import LearnedDepth
 

@@ -17,13 +17,15 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.pixels import at_pixels
-from aquaflow.geometry.robust import MAD_TO_SIGMA, biweight
 from aquaflow.keyframes import LearnedDepths, Pointmap
+from aquaflow.optimise.robust import Tukey, sigma_of
 from aquaflow.prior.contract import Float, Mask, RangeUnit
-from aquaflow.tracking.learned.affine import INDEPENDENT, ITERATIONS, shift_of, shifted_depth
+from aquaflow.tracking.learned.affine import INDEPENDENT, shift_of, shifted_depth
 
 Array = npt.NDArray[np.float64]
 
+ITERATIONS = 8
+"""Of reweighting; each divides the remaining error by five or more."""
 COMPARED = 4000
 """Most pixels that learned and triangulated depths are compared at."""
 LEAST_COMMON = 200
@@ -132,7 +134,7 @@ def agreement(
         return HONESTY[1]
     log_ratio = np.log(z_in_b[sound] * rho_b[sound])
     left = (log_ratio - np.median(log_ratio)) / np.sqrt(variance[sound])
-    return float(np.clip(MAD_TO_SIGMA * np.median(np.abs(left)), *HONESTY))
+    return float(np.clip(sigma_of(left), *HONESTY))
 
 
 def _is_learned(
@@ -206,12 +208,12 @@ def _fit(
     covariance = np.eye(len(found))
     for _ in range(ITERATIONS):
         left = log_ratio - A @ found
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(left) / np.sqrt(stated)))
+        spread = sigma_of(left / np.sqrt(stated))
         excess = spread**2 - float(np.median(own / stated))
         honesty = float(np.clip(np.sqrt(max(excess, 0.0)), *HONESTY))
         sigma = np.sqrt(honesty**2 * stated + own)
         # False depths lie on one side: the unit would follow any part of them.
-        weight = share * biweight(left, sigma) / sigma**2
+        weight = share * Tukey().weight(left / sigma) / sigma**2
         covariance = np.linalg.inv((A.T * weight) @ A + before)
         found = covariance @ ((A.T * weight) @ log_ratio)
     return found, covariance, honesty

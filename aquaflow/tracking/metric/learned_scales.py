@@ -18,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.tracking import LearnedConfig
-from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import KeyframeStore
+from aquaflow.optimise.robust import sigma_of
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.straightening import solve_with_worlds
@@ -134,7 +134,7 @@ def _scales(
     found = np.array([known[int(number)] for number in nodes["number"][rows]])
     excess = np.log(nodes["scale"][rows]) + found[:, 0]
     change = excess[APART:] - excess[:-APART]
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(change - np.median(change)))) / 2.0**0.5
+    spread = sigma_of(change - np.median(change)) / 2.0**0.5
     return _Scales(rows, excess, np.hypot(found[:, 1], spread))
 
 

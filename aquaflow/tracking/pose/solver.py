@@ -1,4 +1,4 @@
-"""Pose of a frame against a keyframe's pointmap: Levenberg-Marquardt (paper, Eq. 3).
+"""Pose of a frame against a keyframe's pointmap: least squares (paper, Eq. 3).
 
 Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
 (notes/measurements.md#pose-solver); between keyframes it may be freed.
@@ -6,13 +6,15 @@ Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.tracking import PoseResidual
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.optimise.least_squares import Ending, NormalEquations, Rules, minimise
+from aquaflow.optimise.robust import Huber
 from aquaflow.render.library import library_or_none
 from aquaflow.tracking.pose.covariance import Degeneracy, cell_sums, pose_covariance
 from aquaflow.tracking.pose.pixel_equations import PixelEquations
@@ -22,23 +24,15 @@ __all__ = ["PoseEstimate", "PoseProblem", "solve_pose"]
 
 Array = npt.NDArray[np.float64]
 
-HUBER = 1.345
-"""Whitened residual where the loss turns linear: 95 % efficiency under Gaussian noise."""
+KERNEL = Huber()
+"""Of whitened residuals."""
 INLIER = 3.0
 """Whitened residual up to which a match counts as an inlier."""
-MAX_ITERATIONS = 15
-"""Limit of Levenberg-Marquardt for one pose."""
-STOP_SIGMAS = 0.1
-"""A step of this many of the pose's own standard deviations is the last. Steps shrink at least
-threefold, also with a third of outliers: the remaining error is a twentieth of the noise."""
-SLACK = 1e-2
-"""Relative growth of the cost that refuses no step. The whitening depends on the pose, and outliers
-gain from a pose that is less certain; the scores leave that out, so near the solution the cost
-does not follow them."""
-FIRST_DAMPING = 1e-6
-"""Initial damping, relative to the diagonal."""
-MAX_DAMPING = 1e6
-"""Damping at which the solver stops: no step reduces the cost."""
+RULES = Rules(iterations=15, sigmas=0.1, slack=1e-2, damping=1e-6)
+"""Steps shrink at least threefold, also with a third of outliers: after one of a tenth of the
+pose's own standard deviation the remaining error is a twentieth of the noise. Growth of the cost by
+a hundredth refuses no step: the whitening depends on the pose, and outliers gain from a pose that
+is less certain; the scores leave that out, so near the solution the cost does not follow them."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +60,7 @@ def solve_pose(
     free_scale: bool = False,
 ) -> PoseEstimate | None:
     """Levenberg-Marquardt from ``initial``; None without matches, or when the normal equations stay
-    unsolvable. Without ``stop_converged`` it takes all MAX_ITERATIONS.
+    unsolvable. Without ``stop_converged`` it takes all iterations.
 
     A match that is no number is left out. With ``free_scale`` the pose is a similarity; the
     ``pixel`` and ``ray`` residuals see its scale only through the frame's own points. Without, its
@@ -80,25 +74,40 @@ def solve_pose(
     if len(matches) == 0 or not initial.is_finite():
         return None
     equations = _equations(matches, residual)
-    T, damping = initial if free_scale else initial.in_source_unit(), FIRST_DAMPING
-    H, g, cost = equations.at(T)
-    for _ in range(MAX_ITERATIONS):
-        step = _damped_step(H, g, damping)
-        if step is None:
-            return None
-        candidate = _move(T, step)
-        new_H, new_g, new_cost = equations.at(candidate)
-        still = stop_converged and float(step @ H @ step) < STOP_SIGMAS**2
-        if not np.isfinite(new_cost) or new_cost > cost * (1.0 + SLACK):
-            damping *= 10.0
-            if still or damping > MAX_DAMPING:
-                break
-            continue
-        T, H, g, cost = candidate, new_H, new_g, new_cost
-        damping = max(damping * 0.1, 1e-9)
-        if still:
-            break
-    return _summary(problem, matches, T, H, *equations.linearise_at(T))
+    start = initial if free_scale else initial.in_source_unit()
+    rules = RULES if stop_converged else replace(RULES, sigmas=0.0)
+    descent = _PoseDescent(equations)
+    found = minimise(descent, start, rules)
+    if found.ending in {Ending.SINGULAR, Ending.NOT_FINITE}:
+        return None
+    H = descent.linearise(found.state).H
+    return _summary(
+        len(problem.points), matches, found.state, H, *equations.linearise_at(found.state)
+    )
+
+
+class _PoseDescent:
+    """A pose as a problem of least squares; cost and equations come in one evaluation."""
+
+    def __init__(self, equations: RowEquations | PixelEquations) -> None:
+        self._equations = equations
+        self._last: tuple[Sim3, NormalEquations] | None = None
+
+    def linearise(self, T: Sim3) -> NormalEquations:
+        """The equations of a step [6 or 7] of the left tangent."""
+        if self._last is None or self._last[0] is not T:
+            self._last = T, NormalEquations(*self._equations.at(T))
+        return self._last[1]
+
+    def cost(self, T: Sim3) -> float:
+        """Of the weighted, whitened Huber loss."""
+        return self.linearise(T).cost
+
+    def move(self, T: Sim3, step: Array) -> Sim3:
+        """First-order retraction of the left tangent."""
+        R = so3_exp(step[3:6])
+        growth = float(np.exp(step[6])) if len(step) == 7 else 1.0
+        return Sim3(R @ T.R, growth * (R @ T.t) + step[:3], growth * T.scale)
 
 
 class RowEquations:
@@ -110,12 +119,13 @@ class RowEquations:
     def at(self, T: Sim3) -> tuple[Array, Array, float]:
         """H [n, n], g [n] and cost of the weighted Huber loss at ``T``."""
         rows, weights = self._linearise(self._matches, T), self._matches.weights
-        return *_normal_equations(rows, weights), _cost(rows.residual, weights)
+        cost = float(KERNEL.cost(np.abs(rows.residual)).sum(0) @ weights)
+        return *_normal_equations(rows, weights), cost
 
     def linearise_at(self, T: Sim3) -> tuple[Array, Array]:
         """Residuals [K, M] at ``T``, and what each match pulls by [n, M]: weighted J' residual."""
         rows = self._linearise(self._matches, T)
-        pull = _huber_weights(rows.residual) * rows.residual * self._matches.weights
+        pull = KERNEL.weight(np.abs(rows.residual)) * rows.residual * self._matches.weights
         return rows.residual, np.asarray((rows.J * pull).sum(1))
 
 
@@ -124,64 +134,20 @@ def _equations(matches: Matches, residual: PoseResidual) -> RowEquations | Pixel
     library = library_or_none()
     if library is None or residual != "pixel" or matches.size != 6 or matches.has_own:
         return RowEquations(matches, residual)
-    return PixelEquations(library, matches, HUBER)
-
-
-def _move(
-    T: Sim3,
-    step: Array,  # [6 or 7]
-) -> Sim3:
-    """First-order retraction of the left tangent."""
-    R = so3_exp(step[3:6])
-    growth = float(np.exp(step[6])) if len(step) == 7 else 1.0
-    return Sim3(R @ T.R, growth * (R @ T.t) + step[:3], growth * T.scale)
-
-
-def _huber_weights(
-    residual: Array,  # [R, M], R residuals of each match
-) -> Array:
-    return HUBER / np.maximum(np.abs(residual), HUBER)
-
-
-def _cost(
-    residual: Array,  # [R, M], R residuals of each match
-    weights: Array,  # [M]
-) -> float:
-    size = np.abs(residual)
-    near = np.minimum(size, HUBER)
-    # Half the square up to HUBER, the tangent from there on.
-    return float(((size - 0.5 * near) * near).sum(0) @ weights)
+    return PixelEquations(library, matches, KERNEL.bound)
 
 
 def _normal_equations(
     rows: Rows,
     weights: Array,  # [M]
 ) -> tuple[Array, Array]:
-    root = np.sqrt(_huber_weights(rows.residual) * weights)
+    root = np.sqrt(KERNEL.weight(np.abs(rows.residual)) * weights)
     J = (rows.J * root).reshape(len(rows.J), -1)
     return J @ J.T, J @ (rows.residual * root).reshape(-1)
 
 
-def _damped_step(
-    H: Array,  # [n, n]
-    g: Array,  # [n]
-    damping: float,
-) -> Array | None:
-    """-(H + damping diag H)^-1 g by Cholesky, with more damping until it succeeds."""
-    diagonal = np.maximum(np.diag(H), 1e-12 * max(float(np.diag(H).max()), 1e-12))
-    while damping <= MAX_DAMPING:
-        try:
-            L = np.linalg.cholesky(H + damping * np.diag(diagonal))
-        except np.linalg.LinAlgError:
-            damping *= 10.0
-            continue
-        step = -np.linalg.solve(L.T, np.linalg.solve(L, g))
-        return step if np.isfinite(step).all() else None
-    return None
-
-
 def _summary(
-    problem: PoseProblem,
+    points: int,
     matches: Matches,
     T: Sim3,
     H: Array,  # [n, n]
@@ -203,5 +169,5 @@ def _summary(
         seen = camera.project(Y[:, inlier].T)
         error_u, error_v = seen[:, 0] - matches.u[inlier], seen[:, 1] - matches.v[inlier]
         residual_px = float(np.median(np.hypot(error_u, error_v)))
-    share = float(inlier.sum()) / len(problem.points)
+    share = float(inlier.sum()) / points
     return PoseEstimate(T, covariance, share, residual_px, degeneracy.conditioning, degeneracy)

@@ -17,12 +17,12 @@ from aquaflow.lab.stress import suite, swim
 from aquaflow.lab.stress.case import REGISTRY, Check
 from aquaflow.mapping.gaussians import gaussians
 from aquaflow.mapping.optimisation import map_optimiser
+from aquaflow.optimise.least_squares import NormalEquations
 from aquaflow.prior import flow, homography
 from aquaflow.render import adam, reference, view_loss, views, water
 from aquaflow.sources import preprocessing
 from aquaflow.tracking import current_keyframe
 from aquaflow.tracking.initialisation import bundle, initialiser
-from aquaflow.tracking.pose import solver
 from aquaflow.water import image_formation, medium
 from tests.command_line import Cli, refused
 
@@ -67,8 +67,8 @@ def test_every_family_has_cases_and_every_case_names_a_guard_that_exists() -> No
 # --- what each guard is for -----------------------------------------------------------------------
 
 
-def unguarded_step(H: np.ndarray, g: np.ndarray, damping: float) -> np.ndarray:
-    return -np.linalg.solve(H, g)
+def unguarded_step(equations: NormalEquations, damping: float) -> np.ndarray:
+    return -np.linalg.solve(equations.H, equations.gradient)
 
 
 def always(*_: object) -> bool:
@@ -100,7 +100,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("black_and_glowing_radiance", [(gaussians, "MIN_RADIANCE", 0.0)]),
     ("picture_through_bare_map", [(water, "MIN_SOLID", 0.0)]),
     ("depth_loss_at_range_0", [(view_loss, "MIN_RANGE", 0.0)]),
-    ("rank_deficient", [(solver, "_damped_step", unguarded_step)]),
+    ("rank_deficient", [(NormalEquations, "solve", unguarded_step)]),
     ("nan_matches_in_bundle", [(bundle, "measured", everything)]),
     ("points_behind_the_camera", [(triangulation, "MIN_DEPTH", -INFINITY)]),
     ("parallel_rays", [(triangulation, "MIN_PARALLAX_RAD", -1.0)]),

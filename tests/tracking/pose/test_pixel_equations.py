@@ -12,7 +12,7 @@ from aquaflow.render.library import load_library
 from aquaflow.tracking.pose import solver
 from aquaflow.tracking.pose.pixel_equations import PixelEquations
 from aquaflow.tracking.pose.residuals import Matches, PoseProblem
-from aquaflow.tracking.pose.solver import HUBER, RowEquations, solve_pose
+from aquaflow.tracking.pose.solver import KERNEL, RowEquations, solve_pose
 from tests.tracking.tracking_scenes import cloud, pose, problem_of
 
 TRUTH = pose((0.05, -0.08, 0.1), (-0.15, 0.06, 0.1))
@@ -39,7 +39,7 @@ def problem(seed: int, around: bool, count: int = 700) -> PoseProblem:
 @pytest.mark.parametrize("at", POSES)
 def test_compiled_equations_are_those_of_the_rows(at: Sim3, around: bool) -> None:
     matches = Matches(problem(1, around), "pixel", free_scale=False)
-    compiled = PixelEquations(load_library(), matches, HUBER)
+    compiled = PixelEquations(load_library(), matches, KERNEL.bound)
     readable = RowEquations(matches, "pixel")
     for found, expected in zip(compiled.at(at), readable.at(at), strict=True):
         scale = np.abs(expected).max()
@@ -51,7 +51,7 @@ def test_compiled_equations_are_those_of_the_rows(at: Sim3, around: bool) -> Non
 @pytest.mark.parametrize("count", [1, 127, 128, 129])
 def test_blocks_that_are_not_full_count_too(count: int) -> None:
     matches = Matches(problem_of(cloud(2, count), TRUTH), "pixel", free_scale=False)
-    H, _, _ = PixelEquations(load_library(), matches, HUBER).at(TRUTH)
+    H, _, _ = PixelEquations(load_library(), matches, KERNEL.bound).at(TRUTH)
     expected = RowEquations(matches, "pixel").at(TRUTH)[0]
     np.testing.assert_allclose(H, expected, atol=1e-12 * np.abs(expected).max())
 

@@ -327,8 +327,8 @@ def test_a_solver_that_may_not_stop_takes_its_last_step_to_the_same_pose(
     early = solve_pose(problem, Sim3.identity())
     stopped_after = len(taken)
     late = solve_pose(problem, Sim3.identity(), stop_converged=False)
-    assert stopped_after < solver.MAX_ITERATIONS
-    assert len(taken) - stopped_after == solver.MAX_ITERATIONS + 1
+    assert stopped_after < solver.RULES.iterations
+    assert len(taken) - stopped_after == solver.RULES.iterations + 1
     assert early is not None
     assert late is not None
     assert max(errors(late.T, early.T)) < 1e-4

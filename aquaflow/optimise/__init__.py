@@ -1,0 +1,1 @@
+"""Least squares: one descent for every problem, robust kernels, covariance."""
