@@ -126,11 +126,11 @@ def assemble(
         checkpointer.take_if_due(disk_is_full)
         refresher.write_if_due(disk_is_full)
 
-    def paused() -> None:
+    def note_pause() -> None:
         checkpointer.take_soon()
         refresher.write_soon()
 
-    standing = DiveStatusFile(folder.path, failures, slam.metric.mounting, before, paused)
+    standing = DiveStatusFile(folder.path, failures, slam.metric.mounting, before, note_pause)
     errors = DeviceErrors(feed.describe)
     loop.watchers += [standing.update, write_what_is_due, lambda live: errors.update()]
     frames_before = len(slam.frames)

@@ -210,7 +210,7 @@ class _Pumps:
     def pump(self, name: str, work: Callable[[], None], last: bool = False) -> None:
         """Run ``work``; with ``last``, no frame comes after its end."""
 
-        def guarded() -> None:
+        def guard() -> None:
             try:
                 work()
             except Exception as error:
@@ -221,7 +221,7 @@ class _Pumps:
                 if last:
                     self.newest.end()
 
-        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        thread = threading.Thread(target=guard, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
 

@@ -59,16 +59,16 @@ def ci_scenes(cache: Path, progress: Progress) -> list[BenchmarkScene]:
     pipe = Path(_cache(cache, "pipe", piped, _write).recording)
     reef = next(Path(scene.recording) for scene in scenes if scene.name == DIMMED_FROM)
 
-    def paused(out: Path, _: dict[str, object]) -> None:
+    def write_paused(out: Path, _: dict[str, object]) -> None:
         pause(pipe, out, PAUSE_AT, PAUSE_FRAMES)
 
-    def dimmed(out: Path, _: dict[str, object]) -> None:
+    def write_dimmed(out: Path, _: dict[str, object]) -> None:
         dim_light(reef, out, DIM_AT, DIM_GAIN)
 
     stopped = {**piped, "pause": [PAUSE_AT, PAUSE_FRAMES]}
     darker = {**SMALL, **PLAIN[DIMMED_FROM], "dim": [DIM_AT, DIM_GAIN]}
-    scenes.append(_cache(cache, PAUSED, stopped, paused))
-    scenes.append(_cache(cache, DIMMED, darker, dimmed))
+    scenes.append(_cache(cache, PAUSED, stopped, write_paused))
+    scenes.append(_cache(cache, DIMMED, darker, write_dimmed))
     progress("scenes", total, total)
     return scenes
 

@@ -129,13 +129,13 @@ def saturation(check: Check, seed: int) -> None:
 def lamp_on_and_off(check: Check, seed: int) -> None:
     """A lamp with a bright middle goes on and off every third frame."""
 
-    def lit(picture: Picture, i: int) -> Picture:
+    def light(picture: Picture, i: int) -> Picture:
         y, x = np.indices(picture.shape[:2])
         middle = np.exp(-((x - CAMERA.cx) ** 2 + (y - CAMERA.cy) ** 2) / 60.0**2)
         gain = 0.35 + 0.8 * middle * (i // 3 % 2)
         return np.asarray(np.clip(picture * gain[..., None], 0, 255), dtype=np.uint8)
 
-    _hard(check, seed, lit, share=0.7)
+    _hard(check, seed, light, share=0.7)
 
 
 @case("images", "prior.flow.normalised_grey")

@@ -102,7 +102,7 @@ def _lines(
     """Lines by the width of what is seen across the newest one; the only stretch of a path is one
     where its ends are further apart than a picture's shorter side."""
 
-    def covered(
+    def classify(
         places: Array,  # [..., 2] on the page
     ) -> npt.NDArray[np.bool_]:
         return np.asarray(view.classes_at(places) == CoverageClass.WELL)
@@ -113,4 +113,4 @@ def _lines(
     if lines:  # now it is known which way is across
         swath = view.scale * extent(newest, lines[-1].right @ to_page) or swath
         lines = survey_lines(view.path, swath, alone=side)
-    return line_state(lines, swath, config.overlap, covered)
+    return line_state(lines, swath, config.overlap, classify)

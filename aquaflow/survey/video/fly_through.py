@@ -97,13 +97,13 @@ class Clear:
         radiance = checkpoint_in(np.ascontiguousarray(splats.colours[:, None]), device)
         bounded, _ = Colours(mapper, 1.0, None).of(radiance, ranges[:, None])
 
-        def sent(values: npt.NDArray[np.floating]) -> torch.Tensor:  # [N, ...]
+        def to_device(values: npt.NDArray[np.floating]) -> torch.Tensor:  # [N, ...]
             return checkpoint_in(np.ascontiguousarray(values, np.float32), device)
 
         self._means, self._wxyz, self._scales = map(
-            sent, (splats.means, splats.wxyz, splats.scales)
+            to_device, (splats.means, splats.wxyz, splats.scales)
         )
-        self._opacities, self._colours = sent(splats.opacities), sent(bounded[:, 0] / 255.0)
+        self._opacities, self._colours = to_device(splats.opacities), sent(bounded[:, 0] / 255.0)
 
     @torch.no_grad()
     def __call__(self, T_wc: Sim3) -> Picture:

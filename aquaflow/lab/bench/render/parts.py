@@ -118,12 +118,12 @@ def time_parts(
     clock = clock or Clock()
 
     def job(part: TimedPart) -> Callable[[], tuple[float, float]]:
-        def timed() -> tuple[float, float]:
+        def measure() -> tuple[float, float]:
             sample = part.measure_time(clock)
             tick()
             return sample
 
-        return timed
+        return measure
 
     for part in parts:
         part.measure_time(clock)

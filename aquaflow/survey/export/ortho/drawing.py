@@ -119,18 +119,18 @@ class GroundSplats:
         """The values premultiplied [H, W, C], and alpha [H, W]."""
         splats, device = self._splats, self._renderer.device
 
-        def sent(values: npt.NDArray[np.floating]) -> Tensor:  # [M, ...]
+        def to_device(values: npt.NDArray[np.floating]) -> Tensor:  # [M, ...]
             return checkpoint_in(np.ascontiguousarray(values, np.float32), device)
 
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[2, 3] = FLIP, far
         K = np.array([[far, 0.0, 0.5 * width], [0.0, far, 0.5 * height], [0.0, 0.0, 1.0]])
         drawn = self._renderer(
-            sent(places),
-            sent(splats.wxyz[chosen]),
-            sent(splats.scales[chosen] / unit),
-            sent(splats.opacities[chosen]),
-            sent(values),
+            to_device(places),
+            to_device(splats.wxyz[chosen]),
+            to_device(splats.scales[chosen] / unit),
+            to_device(splats.opacities[chosen]),
+            to_device(values),
             pose_in(viewmat, device),
             pose_in(K, device),
             width,
