@@ -3,7 +3,8 @@
     python -m tests.write_formats
 
 A table stands between ``<!-- fields of MODULE.CLASS -->`` and ``<!-- end -->`` and has a row for
-each field, or each value of an enumeration, with the text that stands below it in the source.
+each field, or each value of an enumeration, with the text that stands below it in the source; one
+of ``bands`` has a row for each file that a module of rasters describes.
 tests/test_formats.py fails where the page holds something else.
 """
 
@@ -19,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.dive.frames_csv import FRAME_COLUMNS, FrameRow
+from aquaflow.survey.export.ortho.layers import NODATA, RasterFile
 from aquaflow.types import KINDS, STAMP
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "formats.md"
-BLOCK = re.compile(r"(<!-- (fields|telemetry) of ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- (fields|telemetry|bands) of ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 WRITTEN_AS = {FrameRow: dict(zip((f.name for f in fields(FrameRow)), FRAME_COLUMNS, strict=True))}
 """Columns that do not have the names of their fields."""
 
@@ -69,14 +71,30 @@ def table_of_telemetry() -> str:
     return "\n".join([*lines, ""])
 
 
+def table_of_bands(module: str) -> str:
+    """A row for each raster of the module: what its bands are, and how holes are marked."""
+    lines = ["| file | bands | type | holes |", "|---|---|---|---|"]
+    for raster in vars(importlib.import_module(module)).values():
+        if isinstance(raster, RasterFile):
+            bands = "; ".join(raster.bands).format(unit="in the unit of lengths")
+            kind = ("float32", f"{NODATA:g}") if raster.numbers else ("8 bit", "alpha 0")
+            lines.append(f"| `{raster.name}` | {bands} | {kind[0]} | {kind[1]} |")
+    return "\n".join([*lines, ""])
+
+
 def filled(page: str) -> str:
     """The page with its tables as the classes say today."""
 
     def block(match: re.Match[str]) -> str:
-        if match[2] == "telemetry":
-            return match[1] + table_of_telemetry() + match[4]
-        module, _, name = match[3].rpartition(".")
-        return match[1] + table_of(getattr(importlib.import_module(module), name)) + match[4]
+        begin, kind, name, end = match.groups()
+        module, _, described = name.rpartition(".")
+        if kind == "telemetry":
+            table = table_of_telemetry()
+        elif kind == "bands":
+            table = table_of_bands(name)
+        else:
+            table = table_of(getattr(importlib.import_module(module), described))
+        return f"{begin}\n{table}\n{end}"
 
     return BLOCK.sub(block, page)
 
