@@ -17,6 +17,7 @@ from aquaflow.config.vehicle import VehicleConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+NOTES = ROOT / "notes"
 PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "deploy" / "README.md"])
 FOLDERS = (
     "aquaflow",
@@ -34,7 +35,7 @@ SECTIONS = tuple(VehicleConfig.model_fields)
 
 CODE = re.compile(r"`([^`\n]+)`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-PAGE_REFERENCE = re.compile(r"((?:docs|notes)/[a-z_]+\.md)(?:#([a-z0-9_-]+))?")
+PAGE_REFERENCE = re.compile(r"((?:docs|notes)/[\w-]+\.md)(?:#([a-z0-9_-]+))?")
 ENTRY_POINTS = re.compile(r'entry-points\."([\w.]+)"')
 FILE_SUFFIXES = ("csv", "json", "jsonl", "yaml", "tum", "html", "png", "npz", "mp4")
 MODULE_IN_PICTURE = re.compile(r'class="module"[^>]*>(\w+)<')
@@ -50,7 +51,7 @@ def code_in(page: Path) -> list[str]:
 
 def paths_in(page: Path) -> list[str]:
     """Paths from the repository's root, without options and patterns."""
-    words = (word.strip(",;:") for text in code_in(page) for word in text.split())
+    words = (word.partition("#")[0].strip(",;:") for text in code_in(page) for word in text.split())
     return [word for word in words if word.startswith(tuple(f"{name}/" for name in FOLDERS))]
 
 
@@ -164,16 +165,30 @@ def test_every_file_that_a_page_links_to_exists(page: Path) -> None:
     assert [target for target in local if not (page.parent / target).exists()] == []
 
 
-def test_every_page_and_anchor_that_the_code_refers_to_exists() -> None:
+def test_every_page_and_anchor_that_code_and_pages_refer_to_exists() -> None:
     missing = []
-    for folder in (*PACKAGES, "drivers", "sim_drivers", "tests", "deploy"):
+    suffixes = (".py", ".h", ".cpp", ".yaml", ".sh", ".md")
+    for folder in (*PACKAGES, "drivers", "sim_drivers", "tests", "deploy", "docs", "notes"):
         for file in (ROOT / folder).rglob("*"):
-            if file.suffix not in (".py", ".h", ".cpp", ".yaml", ".sh") or file == Path(__file__):
+            if file.suffix not in suffixes or file == Path(__file__):
                 continue
             for page, anchor in PAGE_REFERENCE.findall(file.read_text(encoding="utf-8")):
                 known = (ROOT / page).is_file() and (not anchor or anchor in anchors_of(page))
                 if not known:
                     missing.append(f"{file.relative_to(ROOT)}: {page}#{anchor}")
+    assert missing == []
+
+
+@pytest.mark.parametrize("note", sorted(NOTES.glob("*.md")), ids=lambda note: note.name)
+def test_every_page_and_anchor_that_a_note_links_to_exists(note: Path) -> None:
+    missing = []
+    for link in LINK.findall(note.read_text(encoding="utf-8")):
+        target, _, anchor = link.partition("#")
+        page = (note.parent / target).resolve() if target else note
+        if "://" in link or (page.is_file() and not anchor):
+            continue
+        if not page.is_file() or anchor not in anchors_of(str(page.relative_to(ROOT))):
+            missing.append(link)
     assert missing == []
 
 

@@ -1,7 +1,7 @@
 """The configuration: one model per stage, unknown keys refused with their path.
 
 Every default says where it comes from: ``paper``, a peer, or a measurement
-(docs/paper.md#deviations, notes/measurements.md).
+(docs/paper.md#deviations, notes/).
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ class OptimiserConfig(StageConfig):
     steps_mapping: int = Field(20, ge=0, description="steps after a mapping frame (ARTDECO: 20)")
     steps_common: int = Field(5, ge=0, description="steps after a common frame (ARTDECO: 10)")
     refine_steps: int = Field(
-        1000, ge=0, description="steps after the last frame (notes/performance.md#refining)"
+        1000, ge=0, description="steps after the last frame (notes/2026-11-mapping.md#refining)"
     )
     refine_seconds: float | None = Field(
         None,

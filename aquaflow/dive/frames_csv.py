@@ -26,19 +26,20 @@ class FrameRow:
     index: int
     """Position in the recording, counted before any sub-sampling."""
     source: str
-    """File name of the picture, or where it is in the film: ``clip.mp4#123``."""
+    r"""File name of the picture, ``clip.mp4#123``, or ``camera#123``; control characters as
+    ``\x1b``."""
     t_s: float
     """Seconds since the recording's first frame."""
     frame_class: str
     """``keyframe``, ``mapping``, ``common``, ``skipped``, ``lost`` or ``dropped``."""
     sub_map: int | None = None
-    """Number of the sub-map; None without a pose."""
+    """Number of the sub-map; none without a pose."""
     keyframe: int | None = None
-    """Number of the keyframe that the pose is relative to."""
+    """Number of the keyframe that the pose refers to; none without a pose."""
     quality: float | None = None
-    """Inlier share of the pose's matches."""
+    """Share of the matches that agree with the pose."""
     reason: str = ""
-    """Why the frame has no pose; empty if it has one."""
+    """Why the frame was skipped, lost or dropped; else empty."""
 
     @staticmethod
     def of_cells(cells: Sequence[str]) -> FrameRow:

@@ -27,7 +27,7 @@ from aquaflow.water.posed_picture import SOLID
 
 REGISTERING = 0.85
 """Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a
-few (notes/measurements.md#finishing)."""
+few (notes/2026-11-speed.md#finishing)."""
 
 
 def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:

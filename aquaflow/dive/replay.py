@@ -158,7 +158,7 @@ def fix_threads(threads: int, config: Config) -> None:
     """Results repeat bit for bit at a given number of threads, so it is set once and everywhere.
 
     torch and BLAS get one: their barriers cost whole scheduler quanta on a busy machine
-    (notes/measurements.md#threads), and the heavy work runs in our own pool and in OpenCV's.
+    (notes/2026-11-speed.md#threads), and the heavy work runs in our own pool and in OpenCV's.
     """
     import cv2
     from threadpoolctl import threadpool_limits

@@ -28,33 +28,38 @@ class PoseRow:
     """One line: a pose of the camera; its fields are the columns."""
 
     index: int
-    """Position in the recording."""
+    """Position in the recording, as in frames.csv."""
     t_s: float
     """Seconds since the recording's first frame."""
     utc: datetime | None
-    """With its time zone."""
+    """ISO 8601 with microseconds, such as ``2026-11-22T13:03:05.250000Z``."""
     sub_map: int
+    """Number of the sub-map, as in frames.csv."""
     x: float
-    """Of the camera's centre in n, as in trajectory.tum."""
     y: float
     z: float
+    """The camera's centre in n, as in trajectory.tum."""
     unit: str
     """Of x, y, z: ``m``, or ``map units`` where the sub-map's scale is unknown."""
     latitude_deg: float | None = None
     longitude_deg: float | None = None
-    """Of the camera's centre, WGS 84."""
+    """Of the camera's centre, WGS 84; where an origin and true north are known."""
     depth_m: float | None = None
-    """Below the surface, as the vehicle measured it."""
+    """Below the surface, as the vehicle measured it; linear between samples at most 2 s apart."""
     altitude_m: float | None = None
-    """Above the bottom, as the vehicle measured it."""
+    """Above the bottom, as the vehicle measured it; linear between samples at most 2 s apart."""
     heading_deg: float | None = None
-    """From 0 to 360, clockwise from what x points to."""
+    """From 0 to 360, clockwise from what x points to; of the body, or of the camera if its mounting
+    is unknown; only where gravity is known."""
     roll_deg: float | None = None
     pitch_deg: float | None = None
+    """Of the body or the camera, as the heading."""
     speed_m_s: float | None = None
+    """Of the camera over 0.5 s, at least over the neighbouring poses; none across more than 5 s."""
     sigma_position_m: float | None = None
-    """1 sigma in the direction that is known least."""
+    """1 sigma in the direction that is known least, from the covariance of ``T_nm``."""
     sigma_heading_deg: float | None = None
+    """1 sigma of the heading of n."""
 
     def cells(self) -> list[str]:
         """As text."""

@@ -2,7 +2,7 @@
 
 Fitting from coarse to fine takes half the time of a second DIS flow. A match that was wrong is not
 confirmed by it: what is reversed there fits nothing, or something else
-(notes/measurements.md#backward).
+(notes/2026-11-tracking.md#backward).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class CompactDescriber:
     range_unit: RangeUnit = "shared"
     unit_sigma = float("inf")
     """It was trained on pairs whose scale was taken out: where the scene is twice as far, its range
-    stays nearly the same (notes/measurements.md#learned-depth)."""
+    stays nearly the same (notes/2026-11-priors.md#learned-depth)."""
 
     def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
         """Load the exported ``folder``.
@@ -106,7 +106,7 @@ class CompactDescriber:
 @dataclass
 class CompactPair:
     """Two pictures that the compact network compared. Ranges are nearly monocular, and up to a
-    factor; its C makes poses no better (notes/measurements.md#compact-prior)."""
+    factor; its C makes poses no better (notes/2026-11-priors.md#compact-prior)."""
 
     describer: CompactDescriber
     a: Half

@@ -24,7 +24,8 @@ FILL_PX = 31
 CLAHE_CLIP = 2.0
 """OpenCV's clip limit of the histogram in each tile."""
 CLAHE_TILES = (8, 8)
-"""Local contrast normalisation: water takes contrast unevenly (notes/measurements.md)."""
+"""Local contrast normalisation: water takes contrast unevenly
+(notes/2026-11-tracking.md#initialisation)."""
 
 FORWARD_BACKWARD_PX = 1.0
 """A match that does not come back to within a pixel is occluded, out of view or wrong."""
@@ -52,7 +53,7 @@ MIN_TEXTURE = 30.0
 QUARTER_SCALE = 2
 """DIS is given pictures halved so often where the last matches are known; its matches are then
 fitted at half and at all of the size. To half the size DIS costs three times as much, and
-trajectories are no more accurate (notes/measurements.md#seeded)."""
+trajectories are no more accurate (notes/2026-11-tracking.md#seeded)."""
 
 HALF_SIZE_FITS = 2
 """Times that such a flow is fitted at half the size: once, trajectories err by a quarter more."""

@@ -3,7 +3,7 @@
 A network distinguishes the cells of a picture, whatever the water, the light and the
 distance did to it; but cells are coarse. Dense flow is exact to a fifth of a pixel, but only finds
 what is near its start. So flow starts at the descriptors' matches
-(notes/measurements.md#compact-prior).
+(notes/2026-11-priors.md#compact-prior).
 """
 
 from __future__ import annotations

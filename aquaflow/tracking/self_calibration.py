@@ -27,7 +27,7 @@ show the focal length, which is a matter of wide angles."""
 SYSTEMATIC = np.array([10.0, 5.0])
 """Standard deviations of log focal length and k1, over the noise of the matches (normalised units),
 that no scatter between views shows: keypoints are pulled along edges and by the pixels' grid the
-same way everywhere. Measured on synthetic dives (notes/measurements.md#self-calibration)."""
+same way everywhere. Measured on synthetic dives (notes/2026-11-tracking.md#self-calibration)."""
 KNOWN_SIGMA = 0.1
 """Of the log focal length; above, the dive hardly says more than the guess."""
 

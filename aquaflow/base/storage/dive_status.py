@@ -46,14 +46,16 @@ class DiveStatus:
     """The content of dive.json."""
 
     state: DiveState
+    """What became of the dive."""
     paused: bool = False
     """The pilot wants nothing mapped, until he asks for it."""
     begun_utc: str | None = None
-    """Of a live dive, by the computer's clock; None while that had never been set."""
+    """Of a live dive, by the computer's clock; null while that had never been set."""
     boot: str = ""
-    """Of the kernel under which a live dive last ran; its monotonic clock counts from there."""
+    """Of the kernel under which a live dive last ran, from which its monotonic clock counts; empty
+    of a replay."""
     mounting: dict[str, object] | None = None
-    """Of a live dive's camera in the body, as the config or the camera stated it."""
+    """Of a live dive's camera in the body, as the config or the camera stated it; else null."""
 
     @property
     def is_live(self) -> bool:

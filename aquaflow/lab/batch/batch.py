@@ -244,7 +244,7 @@ class Examiner:
 # --------------------------------------------------------------------------------------------------
 # How much memory a dive will take: from its pictures' size, their number and the map's Gaussians.
 #
-# Fitted to resident sets that were measured (docs/performance.md#memory), and on the safe side.
+# Fitted to resident sets that were measured (notes/2026-11-speed.md#memory), and on the safe side.
 
 BASE_MAP_MB = 325.0
 """`aquaflow map` before its first frame."""

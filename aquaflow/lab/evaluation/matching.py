@@ -1,7 +1,7 @@
 """How well a prior finds pixels again: pictures against themselves, turned, shifted and relit.
 
 A homography gives every pixel its true match, so that real pictures can be used, whose geometry
-is unknown (notes/measurements.md#compact-prior has the figures of the prototypes).
+is unknown (notes/2026-11-priors.md#compact-prior has the figures of the prototypes).
 """
 
 from __future__ import annotations

@@ -22,7 +22,8 @@ class LossWeights:
     """Weights of the terms; defaults of fine-tuning (docs/paper.md#published-values)."""
 
     beta: float = 0.075
-    """Of the matching term; from scratch it must dominate (notes/measurements.md#compact-prior)."""
+    """Of the matching term; from scratch it must dominate
+    (notes/2026-11-priors.md#compact-prior)."""
     points_alpha: float = 0.2
     """Reward of the logarithm of the points' confidence."""
     match_alpha: float = 10.0

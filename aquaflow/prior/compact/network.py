@@ -1,7 +1,8 @@
 """The compact prior's network: a siamese encoder, and a head that compares two encodings.
 
 The encoder sees pictures whose local mean and contrast are made equal, and never where a pixel
-lies: descriptors that know their position learn nothing else (notes/measurements.md#compact-prior).
+lies: descriptors that know their position learn nothing else
+(notes/2026-11-priors.md#compact-prior).
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ MATCH_PX = 4.0
 flow (OpenCV's DIS: 8 x 8), from which depths are triangulated."""
 CELL_RESOLUTIONS = 3.0
 """Least side of a cell that is found, in resolutions of the map. On the synthetic reef of
-notes/measurements.md#reef-numbers rugosity is 4 % low at 3.3 of them and 7 % at 1.6."""
+notes/2026-11-survey.md#reef-numbers rugosity is 4 % low at 3.3 of them and 7 % at 1.6."""
 STEPS = (1.0, 2.0, 5.0)
 """Sides of cells that are found, times powers of ten: dives of one kind get the same."""
 BIN_FOOTPRINTS = 16.0

@@ -21,7 +21,8 @@ from aquaflow.telemetry.world_frame import WorldFrame
 Array = npt.NDArray[np.float64]
 
 RANGE_SIGMA = 0.02
-"""Relative 1 sigma of a rendered range: 1.1 to 2.8 % on held-out views (docs/benchmarks.md)."""
+"""Relative 1 sigma of a rendered range: 1.1 to 2.8 % on held-out views
+(notes/2026-11-benchmarks.md)."""
 CLICK_SIGMA_PX = 1.0
 """1 sigma of a point that a person marked, and of the refined poses."""
 LEAST_ALPHA = 0.5

@@ -22,8 +22,8 @@ Array = npt.NDArray[np.float64]
 
 MATCH_SIGMA = 0.25
 """What neighbouring cells err apart, over the sigma of rays known to 1 pixel: matches of two
-pictures err by 0.12 to 0.25 px (notes/measurements.md#backward); poses and camera, which make up
-the rest of a pixel, move whole pictures."""
+pictures err by 0.12 to 0.25 px (notes/2026-11-tracking.md#backward); poses and camera, which
+make up the rest of a pixel, move whole pictures."""
 LEAST_CELLS = 30
 """With slopes, for statistics of them; judgement."""
 RELIEF_PERCENT = (2.0, 98.0)

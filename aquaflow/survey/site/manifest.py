@@ -32,7 +32,8 @@ class SiteDive:
     path: str
     """Of the dive folder: relative to the site where it is on the same file system."""
     fingerprint: str
-    """Of the files that a merge reads, when the dive was added."""
+    """SHA-256 over places.npz, metric.json, trajectory.tum and frames.csv when the dive was
+    added."""
 
     def folder(self, site: Path) -> Path:
         """The dive folder."""

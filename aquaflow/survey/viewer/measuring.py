@@ -24,7 +24,8 @@ Array = npt.NDArray[np.float64]
 Asked = dict[str, Any]
 
 RANGE_SIGMA = 0.02
-"""Relative 1 sigma of the map's ranges: 1.1 to 2.8 % on held-out views (docs/benchmarks.md)."""
+"""Relative 1 sigma of the map's ranges: 1.1 to 2.8 % on held-out views
+(notes/2026-11-benchmarks.md)."""
 PROFILE_POINTS = 64
 """Places along a profile."""
 LEAST_SIGMA = 1e-9

@@ -27,7 +27,7 @@ log-scale. What a keyframe's depths have in common does not average out over its
 base has errors of its own: judgement, ten times what the pose solver states."""
 DRIFT = np.array([0.03, 0.03, 0.03, 0.01, 0.01, 0.01, 0.02])
 """1 sigma of drift for each depth that the camera travelled: three times that of the worst shared
-clip (docs/benchmarks.md), because the base has drifted too."""
+clip (notes/2026-11-benchmarks.md), because the base has drifted too."""
 LARGEST_CHI2 = 24.3
 """Of seven numbers: chance exceeds it once in a thousand times."""
 RULES = Rules(iterations=10, sigmas=1e-3, damping=0.0)

@@ -1,4 +1,4 @@
-"""Two-view initialisation that waits for parallax (notes/measurements.md#initialisation).
+"""Two-view initialisation that waits for parallax (notes/2026-11-tracking.md#initialisation).
 
 Frames are matched to one reference until the parallax decides the geometry. Essential-matrix and
 homography poses are then compared; the best hypothesis gives the waiting frames their poses.
@@ -55,7 +55,7 @@ wait. Forwards in a tiled pool it is 0.27 to 0.5; reef, Curasao and IUI3, frame 
 MIN_CONFIDENCE = 0.1
 """Of a match that decides the geometry, where there are enough of them. Next to depth edges, where
 the match follows what is in front, it is below; the first keyframe's depths, bent by such matches,
-turned every link for 70 frames (notes/measurements.md#forward-views)."""
+turned every link for 70 frames (notes/2026-11-tracking.md#forward-views)."""
 
 
 class Initialiser:

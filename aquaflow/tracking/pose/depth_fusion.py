@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 LEAST_CONFIDENCE = 0.005
 """Confidence that a match is given at least. Next to a depth edge it falls below a hundredth: taken
 for 0.05 there, forward views drifted by 0.3 to 0.5 % more per 100 keyframes
-(notes/measurements.md#forward-views)."""
+(notes/2026-11-tracking.md#forward-views)."""
 MEASUREMENT_FLOOR = 0.01
 """Relative sigma that no single two-view depth is trusted beyond: flow errors are not independent
 from frame to frame."""

@@ -1,7 +1,7 @@
 """Pose of a frame against a keyframe's pointmap: least squares (paper, Eq. 3).
 
 Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
-(notes/measurements.md#pose-solver); between keyframes it may be freed.
+(notes/2026-11-tracking.md#pose-solver); between keyframes it may be freed.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def test_a_latency_that_all_messages_share_is_seen_with_round_trips_only() -> No
 
 
 def test_a_one_sided_round_trip_is_wrong_by_no_more_than_it_says() -> None:
-    """A peer that answers at once to requests that waited 20 ms (notes/measurements.md#clocks)."""
+    """A peer that answers at once to requests that waited 20 ms (notes/2026-11-speed.md#clocks)."""
     mapping = ClockMapping()
     for k in range(100):
         device_ns = k * SECOND // 10

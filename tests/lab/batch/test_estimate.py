@@ -1,4 +1,4 @@
-"""The estimate of a dive's memory, against the resident sets in docs/performance.md."""
+"""The estimate of a dive's memory, against the resident sets in notes/2026-11-speed.md."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def test_what_a_peer_matched_is_said_below_the_table(tmp_path: Path) -> None:
     assert "colmap ran with SIFT." in section("x.png", result["machine"], result["runs"])
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/benchmarks.md", "out/page.md"])
+@pytest.mark.parametrize("name", ["README.md", "notes/2026-11-benchmarks.md", "out/page.md"])
 def test_a_page_gets_the_section_between_its_markers(tmp_path: Path, name: str) -> None:
     result = benchmark([REEF], [Contender("fast")], 1, tmp_path / "out", quiet, pretended)
     readme, picture = tmp_path / name, tmp_path / "out" / "bench.png"

@@ -2,5 +2,5 @@
 
 Geometry costs most and is kept in a pool on disk; water, light, the camera's behaviour and the
 window that is looked at are drawn anew each time a pair is used
-(notes/measurements.md#compact-prior).
+(notes/2026-11-priors.md#compact-prior).
 """

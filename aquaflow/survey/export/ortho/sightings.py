@@ -28,7 +28,7 @@ STRIDE_PX = 2
 """Ranges are kept of every second pixel: 65 kB a view of 480 x 270."""
 SAME_RANGE = 0.05
 """Relative difference up to which two ranges are of one surface: rendered ranges err by 1 to 3 %
-(docs/benchmarks.md), and steps of relief below it hide nothing worth the name."""
+(notes/2026-11-benchmarks.md), and steps of relief below it hide nothing worth the name."""
 FAR = 3.0
 """Times the median range beyond which what a view shows does not widen the raster: there it is
 drawn from a ninth of the pixels."""

@@ -36,7 +36,7 @@ HEIGHT_SIGMA_PX = 0.5
 SPREAD_SHARE = 0.75
 """1 sigma of a height over the spread of the heights within the pixel. Both were chosen on surveys
 of sand and two reefs, so that the stated intervals hold the truth as often as they say
-(notes/measurements.md#orthos)."""
+(notes/2026-11-survey.md#orthos)."""
 SIGMA_IS = (
     f"of where the rays of the views that see the pixel meet, each known to {HEIGHT_SIGMA_PX:g} "
     f"pixel of its picture, and {SPREAD_SHARE:g} of the spread of the map's heights within the "
