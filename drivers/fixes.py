@@ -38,7 +38,7 @@ class Fixes:
         self._sigma_m = config.position_sigma_m
         self._last: dict[str, tuple[float, float]] = {}
 
-    def dated(self, t_ns: int) -> int:
+    def date(self, t_ns: int) -> int:
         """When what the device dates ``t_ns`` was measured."""
         return t_ns - self._lag_ns
 
@@ -57,11 +57,11 @@ class Fixes:
         if self._last.get(source) == place:
             return []
         self._last[source] = place
-        t_ns, sigma_m = self.dated(t_ns), self._sigma_m or sigma_m
+        t_ns, sigma_m = self.date(t_ns), self._sigma_m or sigma_m
         return [Position(t_ns, arrival_ns, source, *place, sigma_m)]
 
 
-def moved(fix: Position, north_m: float, east_m: float) -> Position:
+def move(fix: Position, north_m: float, east_m: float) -> Position:
     """The fix of a point that lies ``north_m`` and ``east_m`` away, a few metres at most."""
     if abs(fix.latitude_deg) > ARM_LATITUDE_DEG:
         return fix

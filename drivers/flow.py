@@ -30,7 +30,7 @@ class DeviceState:
         """The second in which the first one came."""
         self._seconds: deque[_Second] = deque(maxlen=WINDOW_S + 1)
 
-    def heard(self, measured_ns: int, arrival_ns: int) -> None:
+    def record(self, measured_ns: int, arrival_ns: int) -> None:
         """A picture or a sample; both moments are CLOCK_MONOTONIC."""
         number = arrival_ns // SECOND_NS
         if self._newest_ns is None:

@@ -53,7 +53,7 @@ def units_of(data: bytes) -> Units:
     return [unit for unit in START.split(data) if unit]
 
 
-def decoded(
+def decode(
     pictures: Iterator[tuple[Label, Units]],
 ) -> Generator[tuple[Label, npt.NDArray[np.uint8] | None], None, None]:
     """Each label with its picture [H, W, 3] BGR; None where the bytes make none, or need an earlier
@@ -70,7 +70,7 @@ def decoded(
 
     source = _Flv(pictures)
     source.begin()
-    yield from source.taken(source.first)
+    yield from source.skip_before(source.first)
     if source.failure is not None:
         raise source.failure
     capture = video_capture(source, OPTIONS)
@@ -81,7 +81,7 @@ def decoded(
                 failed_in_a_row = 0
                 number = source.first + round(capture.get(cv2.CAP_PROP_POS_MSEC))
                 _, shown = capture.retrieve()
-                yield from source.taken(number)
+                yield from source.skip_before(number)
                 if number in source.labels:
                     yield source.labels.pop(number), np.asarray(shown, np.uint8)
             elif source.ended:
@@ -115,7 +115,7 @@ class _Flv(io.BufferedIOBase, Generic[Label]):
         while not self._rest and not self.ended:
             self._take()
 
-    def taken(self, number: int) -> Iterator[tuple[Label, None]]:
+    def skip_before(self, number: int) -> Iterator[tuple[Label, None]]:
         """Those before picture ``number``: nothing came of them."""
         for each in [each for each in self.labels if each < number]:
             yield self.labels.pop(each), None
@@ -151,12 +151,14 @@ class _Flv(io.BufferedIOBase, Generic[Label]):
 
     def _tags(self, units: Units, number: int) -> bytes:
         """A picture, after its parameters if they are new; nothing before the first of them."""
-        configured = self._configured(units, number)
+        configured = self._parameter_tags(units, number)
         if not self._parameters:
             return b""
-        return configured + _tag(number, PICTURE[_has(units, KEY_PICTURE)] + _sized(units))
+        return configured + _tag(
+            number, PICTURE[_has(units, KEY_PICTURE)] + _length_prefixed(units)
+        )
 
-    def _configured(self, units: Units, number: int) -> bytes:
+    def _parameter_tags(self, units: Units, number: int) -> bytes:
         """What precedes a picture that brings parameters other than those known."""
         kinds = (SEQUENCE_PARAMETERS, PICTURE_PARAMETERS)
         brought = [next((each for each in units if _kind(each) == kind), b"") for kind in kinds]
@@ -177,7 +179,7 @@ def _has(units: Units, kind: int) -> bool:
     return any(_kind(each) == kind for each in units)
 
 
-def _sized(units: Units) -> bytes:
+def _length_prefixed(units: Units) -> bytes:
     """Each unit after its length."""
     return b"".join(struct.pack(">I", len(unit)) + unit for unit in units)
 

@@ -169,7 +169,7 @@ class LiveCamera:
                 try:
                     self._stream()
                 except OSError as error:
-                    self._lost(error)
+                    self._lose(error)
                     if self._counts.received > received:
                         retry_s = self._config.first_retry_s
                     self._closing.wait(retry_s)
@@ -179,7 +179,7 @@ class LiveCamera:
         finally:
             self._newest.end(discard=True)
 
-    def _lost(self, error: OSError) -> None:
+    def _lose(self, error: OSError) -> None:
         if str(error) != self.reason:
             if self.state in (CameraState.STREAMING, CameraState.LATE):
                 self._tell("lost", f"is lost: {error}")
@@ -210,7 +210,7 @@ class LiveCamera:
             heard_ns = self._now_ns()
             while not self._closing.is_set():
                 picture = capture.read(min(READ_S, self._config.stall_s))
-                if picture is not None and self._received(picture):
+                if picture is not None and self._queue(picture):
                     heard_ns = self._now_ns()
                 elif self._now_ns() - heard_ns > self._config.stall_s * 1e9:
                     said = "no picture" if picture is None else picture.stale
@@ -218,7 +218,7 @@ class LiveCamera:
         finally:
             capture.close()
 
-    def _received(self, picture: RawPicture) -> bool:
+    def _queue(self, picture: RawPicture) -> bool:
         """Queue a picture; False if it is too old to count as a sign of life."""
         self._counts.received += 1
         lost = self._sequence.before(picture.sequence)
@@ -239,7 +239,7 @@ class LiveCamera:
             self._counts.reconnects += self._opened_anew
             self._opened_anew = False
         picture.t_ns = self._clock.stamp(picture.exposed_ns, picture.device_ns, picture.arrival_ns)
-        self.flow.heard(picture.t_ns, picture.arrival_ns)
+        self.flow.record(picture.t_ns, picture.arrival_ns)
         self._newest.put(picture)
         return True
 
@@ -329,7 +329,7 @@ class ExposureClock:
         source_ns = claimed_ns if claimed_ns is not None else arrival_ns
         t_ns = source_ns
         if device_ns is not None and claimed_ns is not None:
-            t_ns = self._bridged(claimed_ns, device_ns, arrival_ns)
+            t_ns = self._bridge(claimed_ns, device_ns, arrival_ns)
         if not _plausible(t_ns, arrival_ns):
             t_ns = arrival_ns
         t_ns = max(t_ns, self._last_ns + 1)
@@ -337,7 +337,7 @@ class ExposureClock:
         self._last_ns = t_ns
         return t_ns
 
-    def _bridged(self, claimed_ns: int, device_ns: int, arrival_ns: int) -> int:
+    def _bridge(self, claimed_ns: int, device_ns: int, arrival_ns: int) -> int:
         """The device's clock plus an offset that follows the claimed one slowly."""
         wanted_ns = claimed_ns - device_ns
         known = self._device_ns is not None and _plausible(device_ns + self._offset_ns, arrival_ns)

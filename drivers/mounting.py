@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from aquaflow.config.device import MountingConfig
-from aquaflow.drivers.fixes import moved
+from aquaflow.drivers.fixes import move
 from aquaflow.drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 from aquaflow.types import (
     Acceleration,
@@ -50,14 +50,14 @@ class BodyFrame:
     def refer(self, sample: TelemetrySample, mounting: Mounting) -> TelemetrySample:
         """``sample`` as a sensor at the body's origin would have it."""
         if mounting.turned:
-            sample = _turned(sample, mounting)
+            sample = _turn(sample, mounting)
         if isinstance(sample, Attitude):
             self._attitude = sample
         elif isinstance(sample, AngularRate):
             self._rate = sample
-        return self._moved(sample, mounting.arm_b) if any(mounting.arm_b) else sample
+        return self._move(sample, mounting.arm_b) if any(mounting.arm_b) else sample
 
-    def _moved(self, sample: TelemetrySample, arm_b: Vector) -> TelemetrySample:
+    def _move(self, sample: TelemetrySample, arm_b: Vector) -> TelemetrySample:
         if isinstance(sample, Velocity):
             if self._rate is None or _stale(self._rate, sample):
                 return sample
@@ -77,7 +77,7 @@ class BodyFrame:
             arm_m = math.hypot(arm_b[0], arm_b[1]) / math.sqrt(2.0)
             return replace(antenna, sigma_m=math.hypot(antenna.sigma_m, arm_m))
         north_m, east_m, _ = rotate(self._attitude.wxyz, arm_b)
-        return moved(antenna, -north_m, -east_m)
+        return move(antenna, -north_m, -east_m)
 
     def _below(self, arm_b: Vector, sample: TelemetrySample) -> float:
         """How far the sensor lies below the body's origin, metres."""
@@ -90,7 +90,7 @@ def _stale(state: Attitude | AngularRate, sample: TelemetrySample) -> bool:
     return abs(sample.t_ns - state.t_ns) > STATE_LIFE_NS
 
 
-def _turned(sample: TelemetrySample, mounting: Mounting) -> TelemetrySample:
+def _turn(sample: TelemetrySample, mounting: Mounting) -> TelemetrySample:
     q = mounting.q_bs
     if isinstance(sample, Attitude):
         return replace(sample, wxyz=product(sample.wxyz, inverse(q)))

@@ -22,7 +22,7 @@ def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     )
 
 
-def normalised(q: Quaternion) -> Quaternion:
+def normalise(q: Quaternion) -> Quaternion:
     """Raises ZeroDivisionError for the zero quaternion."""
     norm = math.sqrt(sum(value * value for value in q))
     return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)

@@ -139,7 +139,7 @@ class Supervisor:
         samples = self._decoder.feed(data, arrival_ns)
         if samples:
             for sample in samples:
-                self.flow.heard(sample.t_ns, arrival_ns)
+                self.flow.record(sample.t_ns, arrival_ns)
             self._deliver(samples)
 
     def _answer(self, link: ByteLink) -> None:

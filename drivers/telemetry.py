@@ -119,10 +119,10 @@ class LinkTelemetry:
         }
         return {name: report for name, report in reports.items() if report is not None}
 
-    def learned(self) -> dict[str, Learned]:
+    def learned_mappings(self) -> dict[str, Learned]:
         """What :meth:`resume` takes, by device."""
         clocks = {name: decoder.clock for name, decoder in self.decoders.items()}
-        return {name: clock.mapping.learned() for name, clock in clocks.items() if clock}
+        return {name: clock.mapping.learned_mapping() for name, clock in clocks.items() if clock}
 
     def resume(self, learned: Mapping[str, Learned]) -> None:
         """Continue with the devices' clocks as an earlier process since the same boot learned

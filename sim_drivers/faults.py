@@ -62,9 +62,9 @@ class FaultyLink:
         data = self._link.read(timeout_s)
         if data:
             self._count_down()
-            for chunk in self._disturbed(data):
+            for chunk in self._disturb(data):
                 heapq.heappush(self._waiting, (self._due(), next(self._order), chunk))
-        return self._arrived()
+        return self._take_arrived()
 
     def write(self, data: bytes) -> None:
         self._link.write(data)
@@ -79,12 +79,12 @@ class FaultyLink:
             self._link.close()
             raise LinkLostError("disconnected by the fault injector")
 
-    def _disturbed(self, data: bytes) -> list[bytes]:
+    def _disturb(self, data: bytes) -> list[bytes]:
         """The bytes of one read after the faults."""
         if self._happens("drop", self._faults.drop):
             return []
         if self._happens("corrupt", self._faults.corrupt):
-            data = corrupted(data, self._rng)
+            data = corrupt(data, self._rng)
         chunks = [data]
         if self._happens("duplicate", self._faults.duplicate):
             chunks.append(data)
@@ -98,7 +98,7 @@ class FaultyLink:
             late_s += OVERTAKEN_S
         return time.monotonic() + late_s
 
-    def _arrived(self) -> bytes:
+    def _take_arrived(self) -> bytes:
         arrived = b""
         while self._waiting and self._waiting[0][0] <= time.monotonic():
             if arrived and len(arrived) + len(self._waiting[0][2]) > MAX_READ_BYTES:
@@ -119,7 +119,7 @@ def faulty(open_link: OpenLink, faults: Faults) -> tuple[OpenLink, Counter[str]]
     return lambda: FaultyLink(open_link(), faults, rng, injected), injected
 
 
-def corrupted(data: bytes, rng: random.Random, share: float = 0.01) -> bytes:
+def corrupt(data: bytes, rng: random.Random, share: float = 0.01) -> bytes:
     """``data`` with a ``share`` of its bytes, at least one, changed."""
     changed = bytearray(data)
     for _ in range(max(1, round(share * len(data)))):

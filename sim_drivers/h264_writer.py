@@ -48,7 +48,7 @@ class _Bits:
     def __init__(self) -> None:
         self._bits = ""
 
-    def fixed(self, value: int, count: int) -> _Bits:
+    def write_bits(self, value: int, count: int) -> _Bits:
         """u(n)."""
         self._bits += f"{value:0{count}b}"
         return self
@@ -69,17 +69,17 @@ class _Bits:
 
 def _sequence_parameters(columns: int, rows: int) -> bytes:
     """seq_parameter_set_data of the baseline profile, level 3.1, without reordering."""
-    bits = _Bits().fixed(66, 8).fixed(0xC0, 8).fixed(31, 8)
+    bits = _Bits().write_bits(66, 8).write_bits(0xC0, 8).write_bits(31, 8)
     # id, log2_max_frame_num - 4, pic_order_cnt_type, reference frames; then no gaps.
-    bits.golomb(0, 0, 2, 1).fixed(0, 1).golomb(columns - 1, rows - 1)
+    bits.golomb(0, 0, 2, 1).write_bits(0, 1).golomb(columns - 1, rows - 1)
     # Frames only, direct 8x8 inference, no cropping, no usability information.
-    return bits.fixed(0b1100, 4).to_bytes("1")
+    return bits.write_bits(0b1100, 4).to_bytes("1")
 
 
 def _picture_parameters() -> bytes:
     """pic_parameter_set_rbsp: CAVLC, one slice group, no deblocking to speak of."""
-    bits = _Bits().golomb(0, 0).fixed(0, 2).golomb(0, 0, 0).fixed(0, 3)
-    return bits.golomb(0, 0, 0).fixed(0, 3).to_bytes("1")
+    bits = _Bits().golomb(0, 0).write_bits(0, 2).golomb(0, 0, 0).write_bits(0, 3)
+    return bits.golomb(0, 0, 0).write_bits(0, 3).to_bytes("1")
 
 
 def _slice(
@@ -87,13 +87,13 @@ def _slice(
     number: int,
 ) -> bytes:
     """A key frame's only slice."""
-    header = _Bits().golomb(0, 7, 0).fixed(0, 4).golomb(number % 2).fixed(0, 2).golomb(0)
+    header = _Bits().golomb(0, 7, 0).write_bits(0, 4).golomb(number % 2).write_bits(0, 2).golomb(0)
     first = header.golomb(I_PCM).to_bytes("")
     blocks = _blocks(image)
     between = np.frombuffer(_Bits().golomb(I_PCM).to_bytes(""), np.uint8)
     rest = np.concatenate([np.tile(between, (len(blocks), 1)), blocks], axis=1)
     stop = b"\x80"
-    return _escaped(first) + rest.tobytes()[len(between) :] + stop
+    return _escape(first) + rest.tobytes()[len(between) :] + stop
 
 
 def _blocks(
@@ -122,10 +122,10 @@ def _tiles(
 
 
 def _unit(kind: int, payload: bytes) -> bytes:
-    return bytes([kind]) + _escaped(payload)
+    return bytes([kind]) + _escape(payload)
 
 
-def _escaped(payload: bytes) -> bytes:
+def _escape(payload: bytes) -> bytes:
     """With emulation_prevention_three_byte wherever a start code could be seen (7.4.1)."""
     escaped = bytearray()
     for byte in payload:

@@ -41,15 +41,15 @@ class Packetizer:
 
     def packets(self, units: Sequence[bytes], t_ns: int) -> list[bytes]:
         """Of one picture that was taken at ``t_ns``; the last is marked."""
-        aggregated = [_aggregated(units[:-1])] if len(units) > 1 else []
+        aggregated = [_aggregate(units[:-1])] if len(units) > 1 else []
         payloads = [*aggregated, *_fragments(units[-1])]
         ticks = t_ns * CLOCK_HZ // 1_000_000_000 & 0xFFFFFFFF
         return [
-            self._headed(payload, ticks, position == len(payloads) - 1)
+            self._add_header(payload, ticks, position == len(payloads) - 1)
             for position, payload in enumerate(payloads)
         ]
 
-    def _headed(self, payload: bytes, ticks: int, last: bool) -> bytes:
+    def _add_header(self, payload: bytes, ticks: int, last: bool) -> bytes:
         kind = last << 7 | self.payload_type
         head = struct.pack(">BBHII", 0x80, kind, self._number & 0xFFFF, ticks, self._source)
         self._number += 1
@@ -68,7 +68,7 @@ def session(port: int, payload_type: int = H264) -> str:
     return "".join(f"{line}\r\n" for line in lines)
 
 
-def _aggregated(units: Sequence[bytes]) -> bytes:
+def _aggregate(units: Sequence[bytes]) -> bytes:
     sized = [struct.pack(">H", len(unit)) + unit for unit in units]
     return bytes([units[0][0] & KEPT_BITS | AGGREGATE]) + b"".join(sized)
 

@@ -15,7 +15,7 @@ PAGE_BITS = 12
 """Piece n of the memory is mapped at offset n << PAGE_BITS."""
 
 
-def refused(number: int) -> OSError:
+def refusal(number: int) -> OSError:
     """As the kernel refuses."""
     return OSError(number, os.strerror(number))
 
@@ -34,27 +34,27 @@ class Buffers:
     def request(self, count: int, sizes: Sequence[int]) -> None:
         """VIDIOC_REQBUFS: ``count`` buffers of pieces of these sizes; EBUSY while streaming."""
         if self._on:
-            raise refused(errno.EBUSY)
+            raise refusal(errno.EBUSY)
         self._pieces = len(sizes)
         self.memory = [np.zeros(size, np.uint8) for _ in range(count) for size in sizes]
 
     def existing(self, index: int) -> int:
         """``index``, or EINVAL if there is no such buffer."""
         if index * self._pieces >= len(self.memory):
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         return index
 
     def queue(self, index: int) -> None:
         """VIDIOC_QBUF: the buffer may be filled."""
         with self._lock:
             if self.existing(index) in self._queued:
-                raise refused(errno.EINVAL)
+                raise refusal(errno.EINVAL)
             self._queued.append(index)
 
     def start(self) -> None:
         """VIDIOC_STREAMON."""
         if not self._queued:
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         self._on = True
 
     def stop(self) -> None:
@@ -65,7 +65,7 @@ class Buffers:
     def ready(self) -> bool:
         """True if there is a buffer for the next picture; refuses before the start."""
         if not self._on:
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         return bool(self._queued)
 
     def fill(self, payloads: Sequence[npt.NDArray[np.uint8]]) -> int:  # each [bytes]

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.sim_drivers.camera_feed import CameraFeed
-from aquaflow.sim_drivers.v4l2_buffers import PAGE_BITS, Buffers, refused
-from aquaflow.sim_drivers.v4l2_pixels import PixelFormat, encoded
+from aquaflow.sim_drivers.v4l2_buffers import PAGE_BITS, Buffers, refusal
+from aquaflow.sim_drivers.v4l2_pixels import PixelFormat, encode
 
 QUERYCAP, ENUM_FMT, S_FMT, REQBUFS, QUERYBUF, QBUF, DQBUF = 0, 2, 5, 8, 9, 15, 17
 STREAMON, STREAMOFF, S_PARM, G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES = 18, 19, 22, 27, 28, 36, 74
@@ -109,7 +109,7 @@ class V4l2Kernel:
             self._owner, self._buffers = None, Buffers()
 
     def wait(self, fd: int, timeout_s: float) -> bool:
-        if self._gone(fd):
+        if self._is_gone(fd):
             return True
         return self.feed.wait(timeout_s)
 
@@ -120,8 +120,8 @@ class V4l2Kernel:
         if self.spec.interrupts > 0:
             self.spec.interrupts -= 1
             raise InterruptedError(errno.EINTR, os.strerror(errno.EINTR))
-        if self._gone(fd):
-            raise refused(errno.ENODEV)
+        if self._is_gone(fd):
+            raise refusal(errno.ENODEV)
         data = memoryview(argument).cast("B")
         assert len(data) == request >> 16 & 0x3FFF
         calls = {
@@ -145,20 +145,20 @@ class V4l2Kernel:
         self._check_type(data, 4)
         (index,) = struct.unpack_from("I", data)
         if index >= len(self.spec.pixels):
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         data[44:48] = self.spec.pixels[index].encode()
 
     def _enum_sizes(self, fd: int, data: memoryview) -> None:
         (index,) = struct.unpack_from("I", data)
         if index > 0:
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         struct.pack_into("III", data, 8, 1, *self._size())
 
     def _set_format(self, fd: int, data: memoryview) -> None:
         """The size is the recording's, whatever was asked for; so is an unknown pixel format."""
         self._check_type(data)
         if self._owner not in (None, fd):
-            raise refused(errno.EBUSY)
+            raise refusal(errno.EBUSY)
         self._owner = fd
         asked = bytes(data[16:20]).decode("ascii", "replace")
         pixels = asked if asked in self.spec.pixels else self.spec.pixels[0]
@@ -198,7 +198,7 @@ class V4l2Kernel:
     def _check_type(self, data: memoryview, at: int = 0) -> None:
         (kind,) = struct.unpack_from("I", data, at)
         if kind != self.buffer_type:
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
 
     def _stream_on(self, fd: int, data: memoryview) -> None:
         self._check_type(data)
@@ -211,15 +211,15 @@ class V4l2Kernel:
     def _dequeue(self, fd: int, data: memoryview) -> None:
         self._check_type(data, 4)
         if not self._buffers.ready() or not self.feed.wait(0.0):
-            raise refused(errno.EAGAIN)
+            raise refusal(errno.EAGAIN)
         shot = self.feed.take()
         if shot.unplugged:
             self.unplug()
             again = threading.Timer(self.feed.faults.away_s, self._plug_in)
             again.daemon = True
             again.start()
-            raise refused(errno.ENODEV)
-        payloads, damaged = encoded(shot.image, self._format, shot.sequence, shot.corrupt)
+            raise refusal(errno.ENODEV)
+        payloads, damaged = encode(shot.image, self._format, shot.sequence, shot.corrupt)
         flags = MONOTONIC_START_OF_EXPOSURE | (ERROR if damaged else 0)
         struct.pack_into("I", data, 0, self._buffers.fill(payloads))
         struct.pack_into("I", data, 12, flags)
@@ -230,28 +230,28 @@ class V4l2Kernel:
 
     def _get_control(self, fd: int, data: memoryview) -> None:
         (control,) = struct.unpack_from("I", data)
-        struct.pack_into("i", data, 4, self._known(control))
+        struct.pack_into("i", data, 4, self._control_value(control))
 
     def _set_control(self, fd: int, data: memoryview) -> None:
         control, value = struct.unpack_from("Ii", data)
-        self._known(control)
+        self._control_value(control)
         self.controls[control] = value
 
     def _query_control(self, fd: int, data: memoryview) -> None:
         (control,) = struct.unpack_from("I", data)
-        self._known(control)
+        self._control_value(control)
         struct.pack_into("iiii", data, 40, 1, 10_000, 1, 5000)
 
-    def _known(self, control: int) -> int:
+    def _control_value(self, control: int) -> int:
         if control not in self.controls:
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         return self.controls[control]
 
     def _size(self) -> tuple[int, int]:
         height, width = self.feed.peek().image.shape[:2]
         return width, height
 
-    def _gone(self, fd: int) -> bool:
+    def _is_gone(self, fd: int) -> bool:
         return not self._present or self._descriptors[fd] not in self._nodes()
 
     def _nodes(self) -> tuple[str, str]:

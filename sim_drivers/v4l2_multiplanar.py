@@ -7,7 +7,7 @@ import errno
 import struct
 from collections.abc import Sequence
 
-from aquaflow.sim_drivers.v4l2_buffers import PAGE_BITS, refused
+from aquaflow.sim_drivers.v4l2_buffers import PAGE_BITS, refusal
 from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
 
 PLANE_BYTES = 64
@@ -61,7 +61,7 @@ class MultiPlanarKernel(V4l2Kernel):
         address, count = struct.unpack_from("QI", data, 64)
         pieces = len(self._format.sizes)
         if count < pieces or not address:
-            raise refused(errno.EINVAL)
+            raise refusal(errno.EINVAL)
         memory = (ctypes.c_uint8 * (PLANE_BYTES * pieces)).from_address(address)
         whole = memoryview(memory).cast("B")
         return [whole[at : at + PLANE_BYTES] for at in range(0, PLANE_BYTES * pieces, PLANE_BYTES)]

@@ -47,7 +47,7 @@ class PixelFormat:
         return (brightness or self.width * self.height * 3,)
 
 
-def encoded(
+def encode(
     image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     form: PixelFormat,
     number: int,
@@ -58,7 +58,7 @@ def encoded(
         # It is cut where a USB packet got lost; the kernel does not look into it.
         whole = _jpeg(image) if form.pixels == "MJPG" else _h264(image, number)
         return [whole[2:] if corrupt else whole], False
-    rows = np.concatenate([_padded(each, form) for each in _planes(image, form)])
+    rows = np.concatenate([_pad(each, form) for each in _planes(image, form)])
     parts = [rows] if len(form.sizes) == 1 else [rows[: form.height], rows[form.height :]]
     return [part.reshape(-1) for part in parts], corrupt
 
@@ -98,7 +98,7 @@ def _planes(
     return [np.asarray(cv2.cvtColor(image, code), np.uint8).reshape(height, -1)]
 
 
-def _padded(
+def _pad(
     plane: Bytes,  # [rows, bytes]
     form: PixelFormat,
 ) -> Bytes:

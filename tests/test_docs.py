@@ -18,13 +18,23 @@ from aquaflow.config.vehicle import VehicleConfig
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "deploy" / "README.md"])
-FOLDERS = ("aquaflow", "drivers", "sim_drivers", "deploy", "tests", "docs", ".ci", ".github")
+FOLDERS = (
+    "aquaflow",
+    "drivers",
+    "sim_drivers",
+    "deploy",
+    "tests",
+    "docs",
+    "notes",
+    ".ci",
+    ".github",
+)
 PACKAGES = ("aquaflow",)
 SECTIONS = tuple(VehicleConfig.model_fields)
 
 CODE = re.compile(r"`([^`\n]+)`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-PAGE_REFERENCE = re.compile(r"docs/([a-z]+\.md)(?:#([a-z0-9_-]+))?")
+PAGE_REFERENCE = re.compile(r"((?:docs|notes)/[a-z_]+\.md)(?:#([a-z0-9_-]+))?")
 ENTRY_POINTS = re.compile(r'entry-points\."([\w.]+)"')
 FILE_SUFFIXES = ("csv", "json", "jsonl", "yaml", "tum", "html", "png", "npz", "mp4")
 MODULE_IN_PICTURE = re.compile(r'class="module"[^>]*>(\w+)<')
@@ -122,7 +132,7 @@ def is_setting(key: str) -> bool:
 def anchors_of(page: str) -> frozenset[str]:
     """Explicit anchors of a page's headings, and those that mkdocs makes of the others."""
     found = set()
-    for line in (DOCS / page).read_text(encoding="utf-8").splitlines():
+    for line in (ROOT / page).read_text(encoding="utf-8").splitlines():
         heading = re.fullmatch(r"#{1,6} (.*?)(?: \{#([\w-]+)\})?", line)
         if heading is not None:
             slug = re.sub(r"[^\w\s-]", "", heading[1]).strip().lower()
@@ -161,9 +171,9 @@ def test_every_page_and_anchor_that_the_code_refers_to_exists() -> None:
             if file.suffix not in (".py", ".h", ".cpp", ".yaml", ".sh") or file == Path(__file__):
                 continue
             for page, anchor in PAGE_REFERENCE.findall(file.read_text(encoding="utf-8")):
-                known = (DOCS / page).is_file() and (not anchor or anchor in anchors_of(page))
+                known = (ROOT / page).is_file() and (not anchor or anchor in anchors_of(page))
                 if not known:
-                    missing.append(f"{file.relative_to(ROOT)}: docs/{page}#{anchor}")
+                    missing.append(f"{file.relative_to(ROOT)}: {page}#{anchor}")
     assert missing == []
 
 

@@ -196,7 +196,7 @@ def test_another_thread_reads_while_keyframes_come_and_go(tmp_path: Path) -> Non
     def look() -> None:
         for turn in range(60):
             number = turn % 6
-            known = store[number].pointmap.known(1.0)
+            known = store[number].pointmap.is_known(1.0)
             assert known.shape == (72, 96)
             read.append(number)
 

@@ -69,7 +69,7 @@ class Map:
         self.metric_frame = metric_frame or WorldFrame.unknown()
         """What the world is, how well that is known, and from which telemetry."""
         self.views: list[MappedView] = [
-            MappedView(view.frame_index, view.keyframe, view.camera, self._posed(view.T_wc))
+            MappedView(view.frame_index, view.keyframe, view.camera, self._pose(view.T_wc))
             for view in in_time(mapper.views)
         ]
         """The mapped frames in the order of the recording."""
@@ -79,7 +79,7 @@ class Map:
         """Of lengths: ``m`` or ``map units``."""
         return self.metric_frame.unit
 
-    def _posed(self, T_mc: Sim3) -> Sim3:
+    def _pose(self, T_mc: Sim3) -> Sim3:
         T_nc = self.metric_frame.pose(T_mc)
         return Sim3(T_nc.R, T_nc.t)
 
@@ -95,7 +95,7 @@ class Map:
         """
         splats = splats_of(self._mapper)
         frame = self.metric_frame
-        return splats if frame.is_identity else splats.transformed(frame.T_nm)
+        return splats if frame.is_identity else splats.transform(frame.T_nm)
 
     @property
     def medium(self) -> Medium | None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.config.presets import configured
+from aquaflow.config.presets import load_configured
 from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.sources import RecordedCamera, open_recording
@@ -59,7 +59,7 @@ def map_recording(
         NotMappedError: the frames were read but gave no map; the folder says why.
     """
     file = None if config is None else Path(config)
-    chosen = configured(file, preset, dict(settings or {}), "settings")
+    chosen = load_configured(file, preset, dict(settings or {}), "settings")
     camera = calibration
     if camera is not None and not isinstance(camera, CameraModel):
         camera = load_camera(Path(camera))

@@ -71,7 +71,7 @@ class Worker:
         goes on until it needs the result."""
         return self._long.submit(work)
 
-    def finished(self, wait: bool = False) -> Iterator[WorkResult]:
+    def take_finished(self, wait: bool = False) -> Iterator[WorkResult]:
         """What has been found of what was asked for, each once; with ``wait`` all of it."""
         while self._asked and (wait or self._asked[0].future.done()):
             asked = self._asked.popleft()

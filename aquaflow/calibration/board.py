@@ -137,7 +137,7 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard | cv2.aruco.GridBoard:
     return cv2.aruco.GridBoard(size, board.marker_m, gap, dictionary)
 
 
-def drawn(board: Board, pixels_per_square: int) -> npt.NDArray[np.uint8]:
+def draw(board: Board, pixels_per_square: int) -> npt.NDArray[np.uint8]:
     """[H, W] the board with a white edge of half a square; ``pixels_per_square`` is a multiple of
     10, so that every cell of a tag is made of whole pixels."""
     made, margin = opencv_board(board), pixels_per_square // 2
@@ -170,7 +170,7 @@ def write_board(board: Board, path: Path) -> None:
     if path.suffix.lower() not in {".pdf", ".png"}:
         raise ConfigError(f"{path} is neither a .pdf nor a .png; choose one of them")
     tens = max(1, round(board.square_m / INCH_M * DOTS_PER_INCH / 10.0))
-    image = Image.fromarray(drawn(board, 10 * tens))
+    image = Image.fromarray(draw(board, 10 * tens))
     exact = 10 * tens * INCH_M / board.square_m
     try:
         if path.suffix.lower() == ".pdf":

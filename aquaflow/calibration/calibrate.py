@@ -86,7 +86,7 @@ def calibrate(
                 "estimating a port needs a known camera with the lens in air and a "
                 "first guess of its flat port; give --known camera.yaml"
             )
-        return _certain(Calibration(views, fit_port(views.used, _sized(known, views))))
+        return _certain(Calibration(views, fit_port(views.used, _scale_to_images(known, views))))
     size = (views.width, views.height)
     start = CameraModel(*size, 1.0, 1.0, views.width / 2.0, views.height / 2.0, model)
     if known is not None:
@@ -106,7 +106,7 @@ def _certain(found: Calibration) -> Calibration:
     return found
 
 
-def _sized(known: CameraModel, views: Views) -> CameraModel:
+def _scale_to_images(known: CameraModel, views: Views) -> CameraModel:
     if abs(known.width * views.height / (known.height * views.width) - 1.0) > 0.01:
         raise InputError(
             f"the known camera has pictures of {known.width} x {known.height}, these are "

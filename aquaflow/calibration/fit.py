@@ -77,7 +77,7 @@ def fit_lens(views: Sequence[BoardImage], start: CameraModel) -> CalibrationFit:
             "no lens explains the corners of the board; check --columns, --rows and --model"
         )
     _, guess, poses = min(fits, key=lambda each: each[0])
-    return _refined(views, CameraUnknowns(guess), poses)
+    return _refine(views, CameraUnknowns(guess), poses)
 
 
 def fit_port(views: Sequence[BoardImage], start: CameraModel) -> CalibrationFit:
@@ -92,7 +92,7 @@ def fit_port(views: Sequence[BoardImage], start: CameraModel) -> CalibrationFit:
             "the pictures of the board do not go with the camera that is given; check that its "
             "lens was calibrated in air"
         )
-    return _refined(views, CameraUnknowns(start, port=True), poses)
+    return _refine(views, CameraUnknowns(start, port=True), poses)
 
 
 def _poses(views: Sequence[BoardImage], camera: CameraModel) -> Array | None:
@@ -137,7 +137,7 @@ def _residuals(
     return np.where(np.isfinite(left), left, UNSEEN_PX)
 
 
-def _refined(
+def _refine(
     views: Sequence[BoardImage],
     parameters: CameraUnknowns,
     poses: Array,  # [V, 6]

@@ -147,9 +147,9 @@ def map_command(
     }  # fmt: skip
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
-    from aquaflow.config.presets import configured
+    from aquaflow.config.presets import load_configured
 
-    settings = configured(
+    settings = load_configured(
         config,
         preset,
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},

@@ -44,10 +44,10 @@ def batch(
 ) -> None:
     """Map many recordings, each into a dive of its own; go on where an earlier batch ended."""
     from aquaflow.config.batch import BatchConfig
-    from aquaflow.config.presets import configured
-    from aquaflow.config.stage import validated
+    from aquaflow.config.presets import load_configured
+    from aquaflow.config.stage import validate
 
-    settings = configured(
+    settings = load_configured(
         config,
         preset,
         {
@@ -57,7 +57,7 @@ def batch(
         },
         "command line",
     )
-    asked = validated(
+    asked = validate(
         BatchConfig,
         {
             "jobs": jobs, "memory_gb": memory, "retries": retries, "cluster": cluster,
@@ -92,18 +92,18 @@ def _content(calib: Path | None) -> str | None:
 
 
 def _exit_code(batched: Batched) -> int:
-    from aquaflow.lab.batch.season import End, failed
+    from aquaflow.lab.batch.season import End, failed_jobs
 
     if batched.season.end is End.STOPPED:
         return INTERRUPTED
-    if failed(batched.season, batched.jobs):
+    if failed_jobs(batched.season, batched.jobs):
         return FAILED
     poor = any(each.state == "poor" for each in batched.season.outcomes.values())
     return POOR_RESULT if poor else 0
 
 
 def _as_json(batched: Batched, out: str) -> dict[str, object]:
-    from aquaflow.lab.batch.season import failed
+    from aquaflow.lab.batch.season import failed_jobs
 
     outcomes = batched.season.outcomes
     return {
@@ -114,7 +114,7 @@ def _as_json(batched: Batched, out: str) -> dict[str, object]:
             for job in batched.jobs
         },
         "notes": batched.notes,
-        "failed": [job.name for job in failed(batched.season, batched.jobs)],
+        "failed": [job.name for job in failed_jobs(batched.season, batched.jobs)],
     }
 
 
@@ -122,7 +122,7 @@ def _print_table(batched: Batched) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from aquaflow.lab.batch.season import End, failed
+    from aquaflow.lab.batch.season import End, failed_jobs
 
     table = Table(box=None, padding=(0, 2, 0, 0))
     for title in ("dive", "state", "frames", "posed", "PSNR dB", "CPU s", "MB", "node"):
@@ -139,7 +139,7 @@ def _print_table(batched: Batched) -> None:
     for note in batched.notes:
         typer.echo(f"Note: {note}.")
     season = batched.season
-    missing = len(failed(season, batched.jobs))
+    missing = len(failed_jobs(season, batched.jobs))
     typer.echo(f"{len(batched.jobs) - missing} of {len(batched.jobs)} dives are there.")
     if season.end is not End.ALL:
         why = season.reason or f"{season.end.value}; give the same command again to go on"

@@ -37,9 +37,9 @@ def doctor(
         findings = examine()
     else:
         from aquaflow.config.vehicle import load_any
-        from aquaflow.doctor.opened import opened
+        from aquaflow.doctor.opened import check_opened
 
-        findings = opened(load_any(config))
+        findings = check_opened(load_any(config))
     if as_json:
         typer.echo(json.dumps(to_json(findings)))
     else:
@@ -82,10 +82,10 @@ def config(
     from aquaflow.config.stage import without_the_lab
     from aquaflow.config.vehicle import load_any
     from aquaflow.doctor import to_json
-    from aquaflow.doctor.opened import opened
+    from aquaflow.doctor.opened import check_opened
 
     settings = Config() if file is None else load_any(file)
-    values, findings = settings.model_dump(mode="json"), opened(settings)
+    values, findings = settings.model_dump(mode="json"), check_opened(settings)
     if not everything:
         values = without_the_lab(type(settings), values)
     if as_json:

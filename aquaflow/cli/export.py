@@ -141,11 +141,11 @@ def export(
             bars(format.value, done, total)
 
         if format is ExportFormat.restored:
-            said, facts = _restored(read, target, recording, progress)
+            said, facts = _restore(read, target, recording, progress)
         elif format in (ExportFormat.laz, ExportFormat.e57):
             said, facts = _points(read, target, format, water, progress)
         elif format is ExportFormat.spz:
-            said, facts = _compressed(read, target, water)
+            said, facts = _compress(read, target, water)
         elif format in (ExportFormat.ortho, ExportFormat.dem):
             kind: Literal["ortho", "dem"] = "dem" if format is ExportFormat.dem else "ortho"
             said, facts = _survey(read, target, kind, resolution, water, bars)
@@ -199,7 +199,7 @@ def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
         raise InputError(f"--format {format.value} knows no {unknown[0]}; leave it out")
 
 
-def _restored(
+def _restore(
     dive: Dive, folder: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.restored import export_restored
@@ -227,7 +227,7 @@ def _points(
     }
 
 
-def _compressed(dive: Dive, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
+def _compress(dive: Dive, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.spz import export_spz
 
     count, where = export_spz(dive, path, water)

@@ -117,7 +117,7 @@ def _with_map(dive: Path) -> Dive:
 
 def _tend_notes(dive: Dive, delete: list[str], as_json: bool) -> None:
     """Remove the notes with these keys, and list what is left."""
-    from aquaflow.survey.measure.notes import listed, read_notes, without, write_notes
+    from aquaflow.survey.measure.notes import list_notes, read_notes, without, write_notes
 
     frame = dive.frame
     notes = read_notes(dive.path, frame)
@@ -127,7 +127,7 @@ def _tend_notes(dive: Dive, delete: list[str], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"unit": frame.unit, "notes": [note.to_json() for note in notes]}))
         return
-    typer.echo("\n".join(listed(notes)) or "The dive has no notes.")
+    typer.echo("\n".join(list_notes(notes)) or "The dive has no notes.")
 
 
 def _between(

@@ -167,7 +167,7 @@ def train_mast3r(
         if process.leads:
             typer.echo(LICENCE_NOTICE, err=True)
         network = load_checkpoint(checkpoint).requires_grad_(True)
-        pairs = finetune.mined(sequences, out, settings, process, advance)
+        pairs = finetune.mine_pairs(sequences, out, settings, process, advance)
         finetune.fine_tune(network, pairs, out, settings, process, advance)
     typer.echo(f"Export {out / finetune.WEIGHTS} with `aquaflow lab prior export mast3r`.")
 

@@ -61,10 +61,10 @@ def record(
 
 def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
     from aquaflow.config.recording import RecordingConfig
-    from aquaflow.config.stage import validated
+    from aquaflow.config.stage import validate
 
     asked = vehicle.recording.model_dump() | {"picture": picture}
-    recording = validated(RecordingConfig, asked, "--picture")
+    recording = validate(RecordingConfig, asked, "--picture")
     return vehicle.model_copy(update={"recording": recording})
 
 

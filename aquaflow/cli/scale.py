@@ -41,7 +41,7 @@ def scale(
     from aquaflow.telemetry.known_lengths.known_lengths_file import FILE, read_known_lengths
 
     read_known_lengths(dive)  # a damaged file is found before the map is drawn
-    known = _measured(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)
+    known = _measure(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)
     with progress_bars(quiet=as_json) as bars:
         marked = keep_length(dive, known, bars)
     together, unchanged = marked.together, marked.unchanged
@@ -60,7 +60,7 @@ def scale(
     typer.echo(unchanged or RESCALED)
 
 
-def _measured(
+def _measure(
     dive: Path,
     frame: int | None,
     start: tuple[float, ...],

@@ -157,14 +157,14 @@ def view(
 ) -> None:
     """Show a finished dive or a site in a browser, to look around and to measure; until Ctrl-C."""
     from aquaflow.base.errors import InputError
-    from aquaflow.config.stage import validated
+    from aquaflow.config.stage import validate
     from aquaflow.config.viewer import ViewerConfig
     from aquaflow.survey.site.manifest import is_site
     from aquaflow.survey.viewer.finished import note_unfinished, open_dive
     from aquaflow.survey.viewer.site_page import open_site
 
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
-    config = validated(ViewerConfig, asked | {"splats": splats}, "command line")
+    config = validate(ViewerConfig, asked | {"splats": splats}, "command line")
     if is_site(dive):
         window = open_site(dive, config, component)
     elif component is None:

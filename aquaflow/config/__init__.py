@@ -1,7 +1,7 @@
 """The configuration: one model per stage, unknown keys refused with their path.
 
 Every default says where it comes from: ``paper``, a peer, or a measurement
-(docs/paper.md#deviations, docs/measurements.md).
+(docs/paper.md#deviations, notes/measurements.md).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from aquaflow.config.old_keys import understood, without_old_keys
 from aquaflow.config.pictures import PicturesConfig
 from aquaflow.config.prior import PriorConfig
 from aquaflow.config.source import SourceConfig
-from aquaflow.config.stage import StageConfig, validated
+from aquaflow.config.stage import StageConfig, validate
 from aquaflow.config.tracking import (
     GateConfig,
     GraphConfig,
@@ -92,7 +92,7 @@ def parse_config(data: dict[str, Any], origin: str) -> Config:
     Raises:
         ConfigError: with the path of the first key that is unknown or out of range.
     """
-    return validated(Config, without_old_keys(data, origin), origin)
+    return validate(Config, without_old_keys(data, origin), origin)
 
 
 def load_config(path: Path, inside: bool = False) -> Config:

@@ -14,15 +14,13 @@ class WaterPriorsConfig(StageConfig):
 
     Measured on twelve fits of six known waters (mean error of beta_a), and on Curasao and IUI3
     (restored views against the raw ones): none 8.2 %, 1.1 and 2.9 dB; dark channel 7.6 %, 1.1 and
-    3.1 dB; with it saturation 7.6 %, 1.1 and 3.4 dB, grey world 8.3 %, 1.1 and 2.9 dB, white
-    backscatter 10.5 %, 1.1 and 2.8 dB.
+    3.1 dB; with it saturation 7.6 %, 1.1 and 3.4 dB. A grey scene (8.3 %, 1.1 and 2.9 dB) and white
+    backscatter (10.5 %, 1.1 and 2.8 dB) lost everywhere and went.
     """
 
     dark_channel: bool = Field(True, description="shadows are nearly black (He et al. 2011)")
     saturation: bool = Field(True, description="few points are brighter than the camera's white")
     regions: bool = Field(True, description="near and far have the same colours on the whole")
-    grey_world: bool = Field(False, description="a scene is grey on the whole")
-    white_backscatter: bool = Field(False, description="open water has little colour of its own")
 
 
 class MediumConfig(StageConfig):
@@ -45,9 +43,6 @@ class MediumConfig(StageConfig):
         description="Adam rate of all medium parameters but MLP_a's; beta_a of four known waters "
         "is 14 % wrong at 5e-4, 7 % at 1e-4, 6 % at 1e-6, and no picture worse: it drifts off the "
         "fit",
-    )
-    max_gradient: Lab[float] = Field(
-        0.01, gt=0, description="gradient norm kept (WaterSplatting clips at 0.001)"
     )
     first_fit_views: Lab[int] = Field(
         12,
@@ -136,7 +131,6 @@ class InsertionConfig(StageConfig):
     bare_probability: Lab[float] = Field(
         0.06, ge=0, le=1, description="least P_a where the map does not cover the picture"
     )
-    covered_alpha: Lab[float] = Field(0.6, gt=0, lt=1, description="alpha that counts as covered")
     agreement: Lab[float] = Field(
         0.1, gt=0, description="relative range difference up to which map and prior agree"
     )
@@ -146,16 +140,7 @@ class InsertionConfig(StageConfig):
         lt=1,
         description="share of a map at its hard cap that new Gaussians may replace, each time",
     )
-    known_sigma: Lab[float] = Field(
-        0.15, gt=0, description="relative range sigma of pixels that may get a Gaussian"
-    )
     opacity: Lab[float] = Field(0.5, gt=0, lt=1, description="of a new Gaussian at full confidence")
-    scale_of_spacing: Lab[float] = Field(
-        0.6, gt=0, description="sigma of a new Gaussian over the expected spacing"
-    )
-    max_spacing_widths: Lab[float] = Field(
-        0.1, gt=0, description="largest spacing over image width"
-    )
 
 
 class LossConfig(StageConfig):
@@ -197,11 +182,8 @@ class OptimiserConfig(StageConfig):
     steps_keyframe: int = Field(20, ge=0, description="steps after a keyframe (ARTDECO: 20)")
     steps_mapping: int = Field(20, ge=0, description="steps after a mapping frame (ARTDECO: 20)")
     steps_common: int = Field(5, ge=0, description="steps after a common frame (ARTDECO: 10)")
-    newest_share: Lab[float] = Field(
-        0.2, ge=0, le=1, description="steps on the newest view (ARTDECO)"
-    )
     refine_steps: int = Field(
-        1000, ge=0, description="steps after the last frame (docs/performance.md#refining)"
+        1000, ge=0, description="steps after the last frame (notes/performance.md#refining)"
     )
     refine_seconds: float | None = Field(
         None,
@@ -223,9 +205,6 @@ class OptimiserConfig(StageConfig):
     prune_every: Lab[int] = Field(200, ge=1)
     prune_opacity: Lab[float] = Field(
         0.02, gt=0, lt=1, description="opacity that is not worth keeping"
-    )
-    prune_radius_widths: Lab[float] = Field(
-        0.5, gt=0, description="largest radius over image width"
     )
     heldout_steps: Lab[int] = Field(
         8, ge=0, description="Gauss-Newton steps of a held-out view's pose at most, map frozen"
@@ -290,7 +269,6 @@ class DecoderConfig(StageConfig):
     max_log_scale: float = Field(1.0, gt=0, description="largest log-scale residual: factor e")
     max_colour: float = Field(0.5, gt=0, description="largest residual of a raw colour")
     rate: float = Field(4e-3, gt=0, description="Adam rate of the weights (ARTDECO: 4e-3)")
-    feature_rate: float = Field(4e-3, gt=0, description="of both features (ARTDECO: 4e-3)")
     voxels: VoxelConfig = VoxelConfig()
 
 

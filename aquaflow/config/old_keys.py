@@ -34,9 +34,22 @@ CONSTANTS: dict[str, Any] = {
     "tracking.learned.least_triangulated": 0.3,
     "tracking.graph.corroboration": 2,
     "tracking.graph.link_scale_sigma": 0.005,
+    "mapping.insertion.covered_alpha": 0.6,
+    "mapping.insertion.scale_of_spacing": 0.6,
+    "mapping.insertion.max_spacing_widths": 0.1,
+    "mapping.insertion.known_sigma": 0.15,
+    "mapping.optimiser.newest_share": 0.2,
+    "mapping.medium.max_gradient": 0.01,
+    "mapping.optimiser.prune_radius_widths": 0.5,
+    "mapping.decoder.feature_rate": 4e-3,
+    "service.limits.gpu_memory_share": 0.05,
+    "viewer.picture_width": 240,
 }
 """Settings of before that are constants now, and their values."""
-GONE: dict[str, str] = {}
+GONE: dict[str, str] = {
+    "mapping.medium.priors.grey_world": "it made the water worse on every clip",
+    "mapping.medium.priors.white_backscatter": "it made the water worse on every clip",
+}
 """Settings of before whose code went, and why."""
 FROM_THE_LAB = "set `lab: true` in the file to keep it from the next release on"
 
@@ -63,8 +76,9 @@ def without_old_keys(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
                 "%s: '%s' is a constant now, %s; the file's %s is not used",
                 origin, path, CONSTANTS[path], value,
             )  # fmt: skip
-    for path, _ in _taken_out(current, GONE):
-        log.warning("%s: '%s' is no key any more and not used: %s", origin, path, GONE[path])
+    for path, value in _taken_out(current, GONE):
+        if value:
+            log.warning("%s: '%s' is no key any more and not used: %s", origin, path, GONE[path])
     return current
 
 

@@ -76,7 +76,7 @@ def preset(name: str) -> dict[str, Any]:
     return deepcopy(PRESETS[name])
 
 
-def configured(
+def load_configured(
     path: Path | None, preset_name: str | None, overrides: dict[str, Any], origin: str
 ) -> Config:
     """The config file, on top of it the preset, and on top of both the ``overrides``.
@@ -87,16 +87,16 @@ def configured(
     """
     base = (Config() if path is None else load_config(path)).model_dump()
     if preset_name is not None:
-        base = merged(base, preset(preset_name))
-    return parse_config(merged(base, overrides), origin)
+        base = merge(base, preset(preset_name))
+    return parse_config(merge(base, overrides), origin)
 
 
-def merged(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+def merge(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
     """``base`` with ``overrides`` on top, key by key at every depth; None overrides nothing."""
     result = dict(base)
     for key, value in overrides.items():
         if isinstance(value, dict):
-            result[key] = merged(result.get(key, {}), value)
+            result[key] = merge(result.get(key, {}), value)
         elif value is not None:
             result[key] = value
     return result

@@ -149,9 +149,6 @@ class LimitsConfig(StageConfig):
     memory_share: float = Field(
         0.10, ge=0, lt=1, description="of the machine's or the unit's memory that must stay free"
     )
-    gpu_memory_share: Lab[float] = Field(
-        0.05, ge=0, lt=1, description="of the memory of the GPU that the map lives on, likewise"
-    )
     temperature_c: float = Field(
         92.0, gt=0, description="degC of the hottest zone; a Jetson throttles itself at 97 to 99"
     )

@@ -25,7 +25,7 @@ class StageConfig(BaseModel):
 AnyStage = TypeVar("AnyStage", bound=StageConfig)
 
 
-def validated(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnyStage:
+def validate(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnyStage:
     """Validate a mapping read from ``origin``.
 
     Raises:

@@ -18,7 +18,7 @@ from aquaflow.config.instruments import (
     WaterLinkedSerialConfig,
 )
 from aquaflow.config.link import EVERY_ADDRESS, ByteLinkConfig, MavlinkLinkConfig, UdpConfig
-from aquaflow.config.stage import StageConfig, validated
+from aquaflow.config.stage import StageConfig, validate
 
 
 class LightsConfig(StageConfig):
@@ -204,4 +204,4 @@ def parse_telemetry(data: dict[str, Any], origin: str) -> TelemetryConfig:
     Raises:
         ConfigError: with the path of the first key that is unknown or out of range.
     """
-    return validated(TelemetryConfig, data, origin)
+    return validate(TelemetryConfig, data, origin)

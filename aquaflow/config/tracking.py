@@ -13,7 +13,7 @@ PoseResidual = Literal["point", "ray", "pixel"]
 
 
 class InitialisationConfig(StageConfig):
-    """Two-view initialisation (docs/measurements.md#initialisation)."""
+    """Two-view initialisation (notes/measurements.md#initialisation)."""
 
     points: int = Field(800, ge=100, description="sample points; 800 solve in 0.1 s")
     min_share: float = Field(
@@ -117,7 +117,7 @@ class GraphConfig(StageConfig):
         30.0,
         ge=1,
         description="the same for loop edges that corroborate each other; drift of monocular scale "
-        "has always the same sign, so it outgrows its covariance (docs/measurements.md)",
+        "has always the same sign, so it outgrows its covariance (notes/measurements.md)",
     )
     corroboration_window: int = Field(
         30, ge=1, description="keyframes between the ends of loop edges that may corroborate"
@@ -278,10 +278,10 @@ class TrackingConfig(StageConfig):
     matches: int = Field(
         5000,
         ge=200,
-        description="matches in the pose solver; more gain nothing (docs/measurements.md)",
+        description="matches in the pose solver; more gain nothing (notes/measurements.md)",
     )
     min_matches: Lab[int] = Field(
-        40, ge=10, description="fewer decide no pose (docs/measurements.md)"
+        40, ge=10, description="fewer decide no pose (notes/measurements.md)"
     )
     min_inlier_share: Lab[float] = Field(
         0.35, gt=0, lt=1, description="inliers below which the frame is lost"

@@ -9,10 +9,10 @@ from pydantic import Field
 from aquaflow.config import Config, read_yaml
 from aquaflow.config.cameras import CameraConfig
 from aquaflow.config.old_keys import understood
-from aquaflow.config.presets import merged, preset
+from aquaflow.config.presets import merge, preset
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.service import ServiceConfig
-from aquaflow.config.stage import validated
+from aquaflow.config.stage import validate
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.config.viewer import ViewerConfig
 
@@ -36,7 +36,7 @@ def load_vehicle(path: Path | None, preset_name: str | None = None) -> VehicleCo
     """
     written = {} if path is None else understood(VehicleConfig, read_yaml(path), str(path))
     changed = {} if preset_name is None else preset(preset_name)
-    return validated(VehicleConfig, merged(written, changed), str(path or preset_name))
+    return validate(VehicleConfig, merge(written, changed), str(path or preset_name))
 
 
 def load_any(path: Path) -> Config:
@@ -49,7 +49,7 @@ def load_any(path: Path) -> Config:
     written = read_yaml(path)
     only_vehicles = VehicleConfig.model_fields.keys() - Config.model_fields.keys()
     model = VehicleConfig if only_vehicles & written.keys() else Config
-    return validated(model, understood(model, written, str(path)), str(path))
+    return validate(model, understood(model, written, str(path)), str(path))
 
 
 def looking_in(vehicle: VehicleConfig, site: Path) -> VehicleConfig:

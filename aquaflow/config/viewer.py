@@ -19,4 +19,3 @@ class ViewerConfig(ListenConfig):
     )  # fmt: skip
     refresh_s: Lab[float] = Field(3.0, gt=0, description="s between pictures of the whole map")
     pose_hz: Lab[float] = Field(4.0, gt=0, le=30, description="frustum and trajectory")
-    picture_width: Lab[int] = Field(240, ge=16, le=1920, description="px of the current picture")

@@ -147,7 +147,7 @@ class _Pass:
             views.offer(tracked.frame.index, tracked.T_wc, tracked.sub_map, rho, keypoints)
 
     def _without_overlay(self, frame: Frame) -> Frame:
-        return self._overlays.masked(frame) if self._config.tracking.mask_overlays else frame
+        return self._overlays.mask(frame) if self._config.tracking.mask_overlays else frame
 
     def _keypoints(self, slam: Slam, picture: Frame) -> Keypoints:
         return slam.prior.encode(picture.image, self.guess, picture.mask).keypoints
@@ -158,7 +158,7 @@ class _Pass:
         posed_in = Counter(t.sub_map for t in results if t.T_wc is not None)
         self.outside_share = 1.0 - max(posed_in.values(), default=0) / max(len(results), 1)
         # The first views were taken before the overlay was found.
-        shown = [view.where(self._overlays.shown) for view in views.posed(poses)]
+        shown = [view.where(self._overlays.shown) for view in views.posed_views(poses)]
         return found_lens(shown, self._lens_of(slam.tracker.camera))
 
     def _lens_of(self, tracked: CameraModel | None) -> Array:

@@ -114,7 +114,7 @@ class DiveFolder:
         self.path = path
         self._recorded = bytearray()
         """The rows so far as lines of frames.csv: a tenth of what they take as objects."""
-        self._lock = self._made()
+        self._lock = self._make()
         try:
             self._open(config, overwrite, resume, dive_s)
         except BaseException:
@@ -145,7 +145,7 @@ class DiveFolder:
         self._log = JsonLog(path / "log.jsonl", append=resume is not None, dive_s=dive_s)
         self._log.attach()
 
-    def _made(self) -> FolderLock:
+    def _make(self) -> FolderLock:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:

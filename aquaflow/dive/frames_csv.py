@@ -107,7 +107,7 @@ def readable_rows(path: Path) -> tuple[list[FrameRow], int]:
     lines = read_regular(path).splitlines(keepends=True)
     damaged = 0 if lines[:1] == [header().encode("utf-8")] else 1
     rows = []
-    for line in _joined(lines[1:]):
+    for line in _join(lines[1:]):
         row = _row_of(line)
         if row is None:
             damaged += 1
@@ -116,7 +116,7 @@ def readable_rows(path: Path) -> tuple[list[FrameRow], int]:
     return rows, damaged
 
 
-def _joined(lines: Sequence[bytes]) -> Iterator[bytes]:
+def _join(lines: Sequence[bytes]) -> Iterator[bytes]:
     """Lines of the file as lines of the table: a reason in quotation marks may have several."""
     waiting: list[bytes] = []
     for line in lines:

@@ -27,7 +27,7 @@ from aquaflow.water.posed_picture import SOLID
 
 REGISTERING = 0.85
 """Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a
-few (docs/measurements.md#finishing)."""
+few (notes/measurements.md#finishing)."""
 
 
 def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
@@ -38,7 +38,7 @@ def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) ->
         return []
     views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
     contain, exposure = slam.failures.contain, 1.0
-    views, as_tracked = _registered(slam, mapper, views, until or Deadline())
+    views, as_tracked = _register_views(slam, mapper, views, until or Deadline())
     with contain("restored exposure"):
         exposure = common_exposure(
             restored_picture(mapper.scene, view, mapper.show(view)).image for view in views
@@ -63,7 +63,7 @@ def _fidelity(view: View, shown: RenderedMap) -> Fidelity:
     return Fidelity(psnr(rendered, real), ssim(rendered, real))
 
 
-def _registered(
+def _register_views(
     slam: Slam, mapper: Mapper, views: Sequence[View], until: Deadline
 ) -> tuple[list[View], dict[int, Fidelity]]:
     """Refine the poses of the ``views``; those that there was time for, in their order, and how

@@ -21,7 +21,7 @@ def in_site(in_base: InBase, keyframes: KeyframeStore) -> dict[str, Any]:
         "format": FORMAT,
         **in_site_numbers(in_base),
         "sub_maps": {
-            str(sub_map): _placed(in_base, sub_map, links, keyframes)
+            str(sub_map): _place(in_base, sub_map, links, keyframes)
             for sub_map, links in sorted(in_base.by_sub_map().items())
         },
     }
@@ -66,7 +66,7 @@ def in_site_notes(in_base: InBase, keyframes: KeyframeStore) -> list[str]:
     return notes
 
 
-def _placed(
+def _place(
     in_base: InBase, sub_map: int, links: list[BaseLink], keyframes: KeyframeStore
 ) -> dict[str, Any]:
     frame = in_base.frame(sub_map, WorldFrame.unknown())

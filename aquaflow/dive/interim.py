@@ -85,7 +85,7 @@ class Interim:
 
     def write_path(self) -> None:
         """trajectory.tum, metric.json and the cameras."""
-        poses, folder = self._posed(), self._run.folder
+        poses, folder = self._pose(), self._run.folder
         frames = {int(n): self._outputs.frame(int(n)) for n in np.unique(poses.sub_maps)}
         order = np.argsort(poses.t_s, kind="stable")
         folder.write_poses(
@@ -132,7 +132,7 @@ class Interim:
 
     def _rows(self) -> list[PoseRow]:
         """Each pose in the order of the recording; what telemetry says of it comes at the end."""
-        poses, rows = self._posed(), []
+        poses, rows = self._pose(), []
         for i in np.argsort(poses.index, kind="stable"):
             x, y, z = poses.positions[i].tolist()
             number = int(poses.sub_maps[i])
@@ -144,17 +144,17 @@ class Interim:
     @property
     def _main(self) -> int:
         """The sub-map with the most posed frames; the earliest of equals."""
-        counts = np.bincount(self._posed().sub_maps, minlength=1)
+        counts = np.bincount(self._pose().sub_maps, minlength=1)
         return int(counts.argmax())
 
-    def _posed(self) -> DivePoses:
+    def _pose(self) -> DivePoses:
         if self._poses is None:
-            self._poses = posed(self._parts, self._keyframes, self._outputs)
+            self._poses = pose(self._parts, self._keyframes, self._outputs)
         return self._poses
 
     def _numbers(self, gaussians: int) -> dict[str, Any]:
         """The keys of metrics.json that are known."""
-        slam, poses = self._run.slam, self._posed()
+        slam, poses = self._run.slam, self._pose()
         kinds = Counter(np.concatenate([part["class"] for part in self._parts]).tolist())
         count = {kind: kinds[CLASSES.index(kind)] for kind in FrameClass if kind in CLASSES}
         return {
@@ -180,7 +180,7 @@ class Interim:
         }
 
 
-def posed(
+def pose(
     parts: list[Array],  # each [n] FRAME
     keyframes: list[tuple[Sim3, int]],  # pose and sub-map of each
     outputs: MetricOutputs,

@@ -45,7 +45,7 @@ class EarlyRecords(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         self._records.append(record)
 
-    def taken(self) -> list[logging.LogRecord]:
+    def take(self) -> list[logging.LogRecord]:
         """End, and the records."""
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level_before)
@@ -57,7 +57,7 @@ def _early() -> list[EarlyRecords]:
     return [handler for handler in handlers if isinstance(handler, EarlyRecords)]
 
 
-def _opened(path: Path, append: bool) -> TextIO:
+def _open_log(path: Path, append: bool) -> TextIO:
     if not append:
         path.unlink(missing_ok=True)
     return io.TextIOWrapper(open_to_append(path), encoding="utf-8")
@@ -78,7 +78,7 @@ class JsonLog(logging.Handler):
         """``dive_s``: seconds since the dive's first frame; None before it, and in a replay."""
         super().__init__(logging.INFO)
         cut_short = append and is_cut_short(path)
-        self._stream = _opened(path, append)
+        self._stream = _open_log(path, append)
         if cut_short:  # what follows begins a line of its own
             self._stream.write("\n")
         self._levels_before: dict[str, int] = {}
@@ -86,7 +86,7 @@ class JsonLog(logging.Handler):
 
     def attach(self) -> None:
         """Receive what AquaFlow logs from here on, until closed, and what was kept for it."""
-        early = [record for each in _early() for record in each.taken()]
+        early = [record for each in _early() for record in each.take()]
         for name in LOGGERS:
             logger = logging.getLogger(name)
             self._levels_before[name] = logger.level
@@ -120,7 +120,7 @@ class JsonLog(logging.Handler):
             logger.setLevel(level)
         self.acquire()
         try:
-            for entry in self._repeats.held():
+            for entry in self._repeats.held_entries():
                 self._write(entry)
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -184,14 +184,14 @@ class Repeats:
             met.held, met.left_out = entry, met.left_out + 1
             return None
         left_out, met.written_s, met.left_out = met.left_out, now_s, 0
-        return _counted(entry, left_out)
+        return _count(entry, left_out)
 
-    def held(self) -> list[Entry]:
+    def held_entries(self) -> list[Entry]:
         """The newest of each kind that was not written, for the end of the log."""
         waiting = [met for met in self._met.values() if met.left_out]
         self._met.clear()
-        return [_counted(met.held, met.left_out - 1) for met in waiting]
+        return [_count(met.held, met.left_out - 1) for met in waiting]
 
 
-def _counted(entry: Entry, left_out: int) -> Entry:
+def _count(entry: Entry, left_out: int) -> Entry:
     return {**entry, "left_out": left_out} if left_out else entry

@@ -28,7 +28,7 @@ def write_splats(
 ) -> None:
     """map.ply and map_clear.ply, as :meth:`aquaflow.dive.folder.DiveFolder.write_splats` says."""
     with torch.no_grad():
-        plain = mapper.scene.baked(mapper.views)
+        plain = mapper.scene.bake_parameters(mapper.views)
         clear = radiance(plain["raw_colours"])
         seen = clear
         if water is not None:
@@ -39,7 +39,7 @@ def write_splats(
         for name, colours in (("map", seen), ("map_clear", clear)):
             splats = _splats(plain, colours)
             if not frame.is_identity:
-                splats = splats.transformed(frame.T_nm)
+                splats = splats.transform(frame.T_nm)
             write_ply(folder / f"{name}{suffix}.ply", splats)
 
 

@@ -16,7 +16,7 @@ def splats_of(mapper: Mapper) -> PlyGaussians:
 
     With a decoder, each Gaussian as the mapped view nearest to it sees it.
     """
-    plain = mapper.scene.baked(mapper.views)
+    plain = mapper.scene.bake_parameters(mapper.views)
     return PlyGaussians(
         means=map_out(plain["means"]),
         wxyz=map_out(torch.nn.functional.normalize(plain["quats"], dim=-1)),

@@ -75,7 +75,7 @@ class PlyGaussians:
             self.colours[which],
         )  # fmt: skip
 
-    def transformed(self, T: Sim3) -> PlyGaussians:
+    def transform(self, T: Sim3) -> PlyGaussians:
         """The same Gaussians in the frame that ``T`` maps to; their covariance C becomes
         s^2 R C R^T. Colours stay: they are the same from every direction (degree 0)."""
         w, v = T.quaternion[0], T.quaternion[1:]

@@ -131,4 +131,4 @@ def read_splats(dive: Dive, placement: Placement, water: bool) -> PlyGaussians:
     splats = read_ply(path)
     if not len(splats.means):
         raise InputError(f"{path} holds no Gaussians; map the dive again")
-    return splats.transformed(placement.T_un)
+    return splats.transform(placement.T_un)

@@ -56,7 +56,9 @@ def export_posed_pictures(
     views, where = read_posed_views(dive, mapper)
     cloud = PointCloud(read_splats(dive, where, water=not restored), views, where)
     pictures = (
-        _without_water(dive, mapper, recording) if restored else _seen(dive, mapper, recording)
+        _without_water(dive, mapper, recording)
+        if restored
+        else _pictures_seen(dive, mapper, recording)
     )
     with whole_folder(out) as made:
         (made / IMAGES).mkdir()
@@ -68,7 +70,7 @@ def export_posed_pictures(
     return len(views)
 
 
-def _seen(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
+def _pictures_seen(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
     if recording is None:
         raise InputError(
             f"{dive} holds no pictures of its own; add --recording with what was mapped, or "

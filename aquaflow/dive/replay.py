@@ -27,7 +27,7 @@ from aquaflow.telemetry.time_offset import (
     NotSynchronisedError,
     TimeOffset,
     offset_of_log,
-    synchronised,
+    synchronise_samples,
 )
 from aquaflow.telemetry.turns import Array, Turns
 from aquaflow.tracking.base.base import Base
@@ -158,7 +158,7 @@ def fix_threads(threads: int, config: Config) -> None:
     """Results repeat bit for bit at a given number of threads, so it is set once and everywhere.
 
     torch and BLAS get one: their barriers cost whole scheduler quanta on a busy machine
-    (docs/measurements.md#threads), and the heavy work runs in our own pool and in OpenCV's.
+    (notes/measurements.md#threads), and the heavy work runs in our own pool and in OpenCV's.
     """
     import cv2
     from threadpoolctl import threadpool_limits
@@ -196,7 +196,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
                 run.notes.append(str(error))
                 continue
             run.notes.append(in_words(name, offset))
-            for sample in synchronised(samples, offset):
+            for sample in synchronise_samples(samples, offset):
                 run.sample(sample)
             found[name] = offset
     return found
@@ -205,7 +205,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
 def turns_of(results: Sequence[Tracked]) -> Turns:
     """How the camera turned, within every sub-map."""
     posed = [each for each in results if each.T_wc is not None]
-    return Turns.joined(
+    return Turns.join(
         [
             _turns_of_sub_map([each for each in posed if each.sub_map == sub_map])
             for sub_map in sorted({each.sub_map for each in posed})

@@ -125,7 +125,7 @@ class DiveRun:
         """Process a frame; the frames that it finished; a picture that cannot be prepared costs
         itself, not the dive."""
         begun = time.monotonic()
-        prepared = self._prepared(frame)
+        prepared = self._prepare(frame)
         if prepared is None:
             return []
         self._keep(prepared)
@@ -148,7 +148,7 @@ class DiveRun:
                 with self.slam.failures.contain("keeping of telemetry"):
                     self.telemetry_log.add(samples)
 
-    def _prepared(self, frame: Frame) -> Frame | None:
+    def _prepare(self, frame: Frame) -> Frame | None:
         """None for a picture that cannot be prepared, which is dropped."""
         reason = "preparation failed, see log.jsonl"
         with self.slam.stages("prepare", frame.index):
@@ -438,15 +438,15 @@ def _most_common_reason(rows: Sequence[FrameRow]) -> str:
 
 def _what_to_do(config: Config) -> str:
     changed = [
-        *_changed("insertion", config.mapping.insertion, InsertionConfig()),
-        *_changed("optimiser", config.mapping.optimiser, OptimiserConfig(), "prune_"),
+        *_list_changes("insertion", config.mapping.insertion, InsertionConfig()),
+        *_list_changes("optimiser", config.mapping.optimiser, OptimiserConfig(), "prune_"),
     ]
     if changed:
         return f"{' and '.join(changed)}: set it back"
     return "the camera must move sideways, over texture, for depths to be known"
 
 
-def _changed(name: str, asked: StageConfig, usual: StageConfig, prefix: str = "") -> list[str]:
+def _list_changes(name: str, asked: StageConfig, usual: StageConfig, prefix: str = "") -> list[str]:
     """Settings of a stage of the map that are not the default, those called ``prefix``..."""
     return [
         f"mapping.{name}.{key} is {getattr(asked, key)}, by default {getattr(usual, key)}"

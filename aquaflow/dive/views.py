@@ -122,7 +122,7 @@ def open_coverage(failures: Failures) -> CoverageView:
     Raises:
         InputError: it is not installed.
     """
-    view: CoverageView = _loaded("coverage")(failures)
+    view: CoverageView = _load("coverage")(failures)
     return view
 
 
@@ -138,7 +138,7 @@ def open_viewer(
         InputError: it is not installed, or the address is taken.
         ConfigError: the token will not do.
     """
-    view: DiveView = _loaded("viewer")(config, report, coverage and coverage.plan)
+    view: DiveView = _load("viewer")(config, report, coverage and coverage.plan)
     return view
 
 
@@ -149,11 +149,11 @@ def open_finished(folder: Path, config: ViewerConfig) -> ViewPage:
         InputError: it is not installed, the dive lacks a file, or the address is taken.
         ConfigError: the token will not do.
     """
-    page: ViewPage = _loaded("finished")(folder, config)
+    page: ViewPage = _load("finished")(folder, config)
     return page
 
 
-def _loaded(name: str) -> Callable[..., Any]:
+def _load(name: str) -> Callable[..., Any]:
     for entry in entry_points(group=VIEWS, name=name):
         loaded: Callable[..., Any] = entry.load()
         return loaded

@@ -135,7 +135,7 @@ def infer(device: Device) -> Figures:
     settings, card = RuntimeSettings(device, "fp32"), read_card(SHIPPED)
     times = [time.perf_counter()]
     describer = describer_in(SHIPPED, settings)
-    picture = describer.fitted(example_picture(card.height, card.width))
+    picture = describer.fit(example_picture(card.height, card.width))
     for _ in range(2):
         describer.features(picture)
         times.append(time.perf_counter())

@@ -28,7 +28,7 @@ Link = SerialConfig | UdpConfig | TcpConfig | CanConfig | Mavlink2restConfig
 NOT_ASKED = "another computer, which was not asked"
 
 
-def opened(config: Config, machine: MachineProbes | None = None) -> list[CheckResult]:
+def check_opened(config: Config, machine: MachineProbes | None = None) -> list[CheckResult]:
     """Each thing under the path of its key; ``ok`` where it can be used now."""
     machine = machine or MachineProbes()
     found = [*_of_any(config)]
@@ -43,7 +43,7 @@ def _of_any(config: Config) -> Iterator[CheckResult]:
     if config.prior.folder is not None:
         yield _folder("prior.folder", config.prior.folder)
     if config.prior.engine_cache is not None:
-        yield _written("prior.engine_cache", config.prior.engine_cache)
+        yield _check_writable("prior.engine_cache", config.prior.engine_cache)
 
 
 def _of_vehicle(config: VehicleConfig, machine: MachineProbes) -> Iterator[CheckResult]:
@@ -61,7 +61,7 @@ def _of_vehicle(config: VehicleConfig, machine: MachineProbes) -> Iterator[Check
         known = ", ".join(config.cameras) or "none"
         advice = f"name one of the cameras: {known}"
         yield CheckResult("service.camera", "no such camera", service.camera, advice)
-    yield _written("service.dives", service.dives)
+    yield _check_writable("service.dives", service.dives)
     if service.dive.site is not None:
         yield _folder("service.dive.site", service.dive.site)
     for key, listen in (
@@ -185,7 +185,7 @@ def _folder(key: str, path: Path) -> CheckResult:
     return CheckResult(key, "there" if there else "not there", f"folder {path}", advice)
 
 
-def _written(key: str, path: Path) -> CheckResult:
+def _check_writable(key: str, path: Path) -> CheckResult:
     """A folder that is made where it is not there yet."""
     last = next(each for each in (path.absolute(), *path.absolute().parents) if each.exists())
     found = "there" if last == path.absolute() else "will be made"

@@ -49,7 +49,7 @@ def align(
     Raises:
         InputError: fewer than three points, a point that is not finite, or all points in one place.
     """
-    x, y = _checked(source, target)
+    x, y = _check(source, target)
 
     # Means and variances (34)-(37).
     mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
@@ -72,7 +72,7 @@ def align(
     return Alignment(Sim3(R, t, scale), collinear=_on_a_line(dx) or _on_a_line(dy))
 
 
-def _checked(
+def _check(
     source: npt.NDArray[np.floating],  # [N, 3]
     target: npt.NDArray[np.floating],  # [N, 3]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

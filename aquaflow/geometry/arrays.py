@@ -59,7 +59,7 @@ class Cameras:
         return [of_camera(camera) for camera in self.known]
 
 
-def prefixed(
+def add_prefix(
     prefix: str,
     arrays: Arrays,  # by name, of any shape
 ) -> Arrays:
@@ -71,6 +71,6 @@ def under(
     prefix: str,
     arrays: Mapping[str, Array],  # by name, of any shape
 ) -> Arrays:
-    """What :func:`prefixed` put there."""
+    """What :func:`add_prefix` put there."""
     start = f"{prefix}."
     return {name[len(start) :]: array for name, array in arrays.items() if name.startswith(start)}

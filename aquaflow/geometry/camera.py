@@ -25,7 +25,7 @@ from pydantic import (
 from aquaflow.base.errors import ConfigError, path_of_key, words_of
 from aquaflow.base.errors.plain_yaml import read_mapping
 from aquaflow.geometry.port import Port
-from aquaflow.geometry.port_file import DomePortFile, FlatPortFile, PortFile, port_of, stated
+from aquaflow.geometry.port_file import DomePortFile, FlatPortFile, PortFile, as_stated, port_of
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
 
@@ -162,7 +162,7 @@ class CameraFile(BaseModel):
     @field_validator("port", mode="before")
     @classmethod
     def _port_has_measures(cls, value: Any) -> Any:
-        return stated(value)
+        return as_stated(value)
 
     @property
     def kind(self) -> DistortionModel:

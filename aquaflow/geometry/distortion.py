@@ -61,7 +61,7 @@ def undistort_points(
             break
     found, _ = _distort(points, camera)
     close = np.linalg.norm(found - pixels, axis=1) < MAX_UNDISTORTION_ERROR_PX
-    return np.where((close & _unfolded(points, camera))[:, None], points, np.nan)
+    return np.where((close & _unfold(points, camera))[:, None], points, np.nan)
 
 
 def _distort(
@@ -79,7 +79,7 @@ def _distort(
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2), derivative
 
 
-def _unfolded(
+def _unfold(
     points: npt.NDArray[np.float64],  # [M, 2] at z = 1
     camera: CameraModel,
 ) -> npt.NDArray[np.bool_]:

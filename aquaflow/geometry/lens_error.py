@@ -48,7 +48,7 @@ def _factor(
     lens: Array,  # [5]
 ) -> Array:
     """[N, 1] of the radial distortion."""
-    squared = _squared(rays)
+    squared = _square(rays)
     return np.asarray(1.0 + lens[1] * squared + lens[2] * squared**2)
 
 
@@ -57,7 +57,7 @@ def slope(
     lens: Array,  # [5]
 ) -> Array:
     """[N, 2, 2] of :func:`seen_at` by the rays."""
-    growth = (2.0 * lens[1] + 4.0 * lens[2] * _squared(rays))[..., None]
+    growth = (2.0 * lens[1] + 4.0 * lens[2] * _square(rays))[..., None]
     bend = growth * rays[:, :, None] * rays[:, None, :]
     return np.asarray(np.exp(lens[0]) * (_factor(rays, lens)[..., None] * np.eye(2) + bend))
 
@@ -67,13 +67,13 @@ def by_lens(
     lens: Array,  # [5]
 ) -> Array:
     """[N, 2, 5] of :func:`seen_at` by the errors of the lens."""
-    squared, scaled = _squared(rays), np.exp(lens[0]) * rays
+    squared, scaled = _square(rays), np.exp(lens[0]) * rays
     radial = [_factor(rays, lens) * scaled, squared * scaled, squared**2 * scaled]
     centre = np.broadcast_to(np.eye(2), (len(rays), 2, 2))
     return np.concatenate([np.stack(radial, axis=-1), centre], axis=-1)
 
 
-def _squared(
+def _square(
     rays: Array,  # [N, 2] x and y at z = 1
 ) -> Array:
     """[N, 1] squared radius."""

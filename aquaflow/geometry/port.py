@@ -43,7 +43,7 @@ class FlatPort:
         """[3] unit vector of the line through the centre of projection that every ray meets."""
         return np.array(self.normal)
 
-    def aligned(self) -> FlatPort:
+    def align(self) -> FlatPort:
         """The same port seen in axes whose z is :attr:`axis`."""
         return FlatPort(self.distance_m, self.thickness_m, self.glass, self.water)
 
@@ -75,7 +75,7 @@ class DomePort:
             return np.array([0.0, 0.0, 1.0])
         return centre / (offset if centre[2] >= 0.0 else -offset)
 
-    def aligned(self) -> DomePort:
+    def align(self) -> DomePort:
         """The same port seen in axes whose z is :attr:`axis`."""
         along = (0.0, 0.0, float(self.axis @ np.array(self.centre_m)))
         return DomePort(self.radius_m, self.thickness_m, along, self.glass, self.water)

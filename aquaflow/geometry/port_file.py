@@ -134,7 +134,7 @@ def _triple(numbers: list[float]) -> Triple:
 PortFile = Annotated[FlatPortFile | DomePortFile, Discriminator("kind")]
 
 
-def stated(value: Any) -> Any:
+def as_stated(value: Any) -> Any:
     """A port as a file states it, none of them None.
 
     Raises:

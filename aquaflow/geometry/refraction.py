@@ -23,7 +23,7 @@ STEEPEST_RAD = 0.5 * np.pi - 1e-9
 """Between a ray in air and the normal of a flat port; at more it does not reach the port."""
 
 
-def refracted(
+def refract(
     rays: Array,  # [..., 3] unit vectors
     normals: Array,  # [..., 3] unit vectors, to the side that the rays go to
     ratio: float,
@@ -52,15 +52,15 @@ def rays_in_water(
     if isinstance(port, FlatPort):
         normals = np.broadcast_to(port.axis, rays.shape)
         inner = _to_plane(rays, normals, port.distance_m)
-        in_glass = refracted(rays, normals, 1.0 / port.glass)
+        in_glass = refract(rays, normals, 1.0 / port.glass)
         outer = inner + _to_plane(in_glass, normals, port.thickness_m)
-        return outer, refracted(in_glass, normals, port.glass / port.water)
+        return outer, refract(in_glass, normals, port.glass / port.water)
     centre = np.array(port.centre_m)
     inner = _to_sphere(np.zeros_like(rays), rays, centre, port.radius_m)
-    in_glass = refracted(rays, (inner - centre) / port.radius_m, 1.0 / port.glass)
+    in_glass = refract(rays, (inner - centre) / port.radius_m, 1.0 / port.glass)
     radius = port.radius_m + port.thickness_m
     outer = _to_sphere(inner, in_glass, centre, radius)
-    return outer, refracted(in_glass, (outer - centre) / radius, port.glass / port.water)
+    return outer, refract(in_glass, (outer - centre) / radius, port.glass / port.water)
 
 
 def rays_to_points(
@@ -78,7 +78,7 @@ def rays_to_points(
     along = points @ axis
     aside = points - along[..., None] * axis
     radius = np.linalg.norm(aside, axis=-1)
-    flat = port.aligned()
+    flat = port.align()
     last = STEEPEST_RAD if isinstance(port, FlatPort) else np.pi
     seen = np.isfinite(radius + along) & (
         _miss(np.full_like(radius, last), radius, along, flat) < 0
@@ -94,7 +94,7 @@ def rays_to_points(
         args=at,
         tolerances={"xatol": ANGLE_TOLERANCE_RAD, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0},
     )
-    angle = np.where(_reached(found.x, radius, along, flat), found.x, np.nan)
+    angle = np.where(_reaches(found.x, radius, along, flat), found.x, np.nan)
     direction = aside / np.where(radius > 0.0, radius, 1.0)[..., None]
     return np.asarray(np.cos(angle)[..., None] * axis + np.sin(angle)[..., None] * direction)
 
@@ -112,7 +112,7 @@ def _miss(
     )
 
 
-def _reached(
+def _reaches(
     angle: Array,  # [...] rad
     radius: Array,  # [...] m
     along: Array,  # [...] m

@@ -74,7 +74,7 @@ class Sim3Batch:
     ) -> Sim3Batch:
         return Sim3Batch(self.R[index], self.t[index], self.scale[index])
 
-    def replaced(
+    def replace(
         self,
         index: Index,  # [K] indices, or [N] mask
         other: Sim3Batch,

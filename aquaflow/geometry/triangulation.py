@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 Array = npt.NDArray[np.float64]
 
 MIN_PARALLAX_RAD = np.radians(0.15)
-"""Below this angle a depth from two views is noise (docs/measurements.md#pose-solver)."""
+"""Below this angle a depth from two views is noise (notes/measurements.md#pose-solver)."""
 
 MAX_REPROJECTION_PX = 1.5
 """A match further than this from its epipolar line is an outlier, not a measurement."""

@@ -23,7 +23,7 @@ prior/flow.py). A homography gets double."""
 RANSAC_CONFIDENCE = 0.999
 """Probability of having drawn a sample without outliers."""
 MIN_MATCHES = 40
-"""Fewer matches than this decide nothing (docs/measurements.md#pose-solver)."""
+"""Fewer matches than this decide nothing (notes/measurements.md#pose-solver)."""
 
 
 @dataclass(frozen=True)

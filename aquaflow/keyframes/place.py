@@ -44,7 +44,7 @@ class KeypointDepths:
     variance: Array
     """[M] variance of ``rho``."""
 
-    def known(
+    def is_known(
         self,
         relative_sigma: float,
     ) -> npt.NDArray[np.bool_]:
@@ -80,7 +80,7 @@ class KeyframePlace:
     camera: CameraModel
 
 
-def packed(seen: KeypointDepths) -> npt.NDArray[np.void]:
+def pack(seen: KeypointDepths) -> npt.NDArray[np.void]:
     """[] one structured number: pixels, inverse depths, their sigmas, descriptors."""
     count, dimension = seen.keypoints.descriptors.shape
     if dimension % 2:
@@ -97,11 +97,11 @@ def packed(seen: KeypointDepths) -> npt.NDArray[np.void]:
     return row
 
 
-def unpacked(
+def unpack(
     row: npt.NDArray[np.void],  # [] as from packed
     camera: CameraModel,
 ) -> KeypointDepths:
-    """What :func:`packed` took apart, rounded.
+    """What :func:`pack` took apart, rounded.
 
     Raises:
         DamagedError: it holds numbers that it cannot hold.

@@ -21,7 +21,7 @@ from aquaflow.base.storage.archive import UNREADABLE, open_archive, read_array
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, packed, unpacked
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, pack, unpack
 
 Rows = npt.NDArray[Any]
 """A structured array."""
@@ -81,7 +81,7 @@ def write_places(
     rows = []
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w") as archive:
         for place, seen in places:
-            _add(archive, _name(place.number), packed(seen))
+            _add(archive, _name(place.number), pack(seen))
             rows.append(_row(place))
         index = np.array(rows, PLACE) if rows else np.zeros(0, PLACE)
         there = np.isin(edges["a"], index["number"]) & np.isin(edges["b"], index["number"])
@@ -102,15 +102,15 @@ class PlacesFile:
             InputError: the file is missing, damaged, or of a newer AquaFlow.
         """
         self.path = path
-        about = self._guarded(lambda: json.loads(self._array(ABOUT).tobytes()))
+        about = self._guard(lambda: json.loads(self._array(ABOUT).tobytes()))
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise InputError(
                 f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow, or "
                 "map the dive again"
             )
-        self.places: tuple[KeyframePlace, ...] = self._guarded(self._index)
+        self.places: tuple[KeyframePlace, ...] = self._guard(self._index)
         """In the order of their numbers."""
-        self.edges: Rows = self._guarded(self._edges)
+        self.edges: Rows = self._guard(self._edges)
         """[E] EDGE: the keyframe graph."""
 
     @cached_property
@@ -125,10 +125,10 @@ class PlacesFile:
             InputError: it is damaged.
         """
         camera = self.by_number[number].camera
-        found: KeypointDepths = self._guarded(lambda: unpacked(self._array(_name(number)), camera))
+        found: KeypointDepths = self._guard(lambda: unpack(self._array(_name(number)), camera))
         return found
 
-    def _guarded(self, read: Callable[[], Any]) -> Any:
+    def _guard(self, read: Callable[[], Any]) -> Any:
         try:
             return read()
         except FileNotFoundError as error:

@@ -48,14 +48,14 @@ class Pointmap:
         shape = (camera.height, camera.width)
         return Pointmap(camera, np.zeros(shape), np.full(shape, UNKNOWN_VARIANCE))
 
-    def known(
+    def is_known(
         self,
         relative_sigma: float,
     ) -> Mask:
         """[H, W] pixels whose inverse depth is known to better than ``relative_sigma``."""
         return (self.rho > 1e-6) & (self.variance < (relative_sigma * self.rho) ** 2)
 
-    def completed(
+    def complete(
         self,
         relative_sigma: float,
     ) -> Pointmap:
@@ -64,7 +64,7 @@ class Pointmap:
         learned = self.learned
         if learned is None:
             return self
-        instead = (learned.rho > 0.0) & ~self.known(relative_sigma)
+        instead = (learned.rho > 0.0) & ~self.is_known(relative_sigma)
         rho = np.where(instead, learned.rho, self.rho)
         variance = np.where(instead, learned.variance, self.variance)
         return replace(self, rho=rho, variance=variance, learned=None)

@@ -217,7 +217,7 @@ class KeyframeStore:
         assert self._prior is not None
         encoding_camera, pointmap_camera = self._cameras[number]
         rho, variance, fused = (arrays.pop(name) for name in ("rho", "variance", "fused"))
-        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), _learned(arrays))
+        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), _unpack_learned(arrays))
         _set_writable(pointmap, False)
         packed = {name.removeprefix("encoding."): array for name, array in arrays.items()}
         return _Content(self._prior.unpack(packed, encoding_camera), pointmap)
@@ -229,7 +229,7 @@ def _set_writable(pointmap: Pointmap, writable: bool) -> None:
     pointmap.variance.setflags(write=writable)
 
 
-def _learned(
+def _unpack_learned(
     arrays: Arrays,  # as from _pack
 ) -> LearnedDepths | None:
     """What ``_pack`` wrote, taken out of ``arrays``; None for a pointmap without."""

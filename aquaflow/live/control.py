@@ -122,7 +122,7 @@ class ServiceControl:
             another, self._another = self._another, False
             return another
 
-    def ended(self) -> None:
+    def end_dive(self) -> None:
         """The dive was closed, or could not be begun: the service is idle, or begins the next."""
         with self._lock:
             self._phase = DivePhase.MAPPING if self._another else DivePhase.IDLE

@@ -45,11 +45,11 @@ class Continued:
         """Seconds since the first frame of a moment on this boot's clock; None before it."""
         return None if self.shift_ns is None else (now_ns + self.shift_ns) * 1e-9
 
-    def begun(self, t_ns: int) -> Continued:
+    def begin(self, t_ns: int) -> Continued:
         """A dive that was not begun counts from ``t_ns``, its first frame."""
         return self if self.shift_ns is not None else replace(self, shift_ns=-t_ns)
 
-    def counted(self, frame: Frame | Dropped) -> Frame | Dropped:
+    def count(self, frame: Frame | Dropped) -> Frame | Dropped:
         """A frame of a device that began to count anew."""
         index, t_ns = frame.index + self.first_index, frame.t_ns + self.known_shift_ns
         if isinstance(frame, Dropped):

@@ -61,7 +61,7 @@ class Parts:
     """Of an earlier run of the same dive."""
 
 
-def assembled(
+def assemble(
     name: str,
     choice: Choice,
     feed: Feed,
@@ -98,7 +98,7 @@ def assembled(
     run = DiveRun(name, folder, config, slam, feed.calibration, feed.name_of)
     continued = Continued()
     if choice.checkpoint is not None:
-        continued = _restored(choice.checkpoint, slam, run, maps)
+        continued = _restore(choice.checkpoint, slam, run, maps)
     run.notes += [*choice.notes, *losses, *said]
     for note in run.notes:
         log.warning("%s", note)
@@ -149,7 +149,7 @@ def _has_maps(known: Checkpoint | None) -> bool:
     return known is not None and bool(known.facts["mapping"]["maps"])
 
 
-def _restored(known: Checkpoint, slam: Slam, run: DiveRun, maps: OwnedMaps) -> Continued:
+def _restore(known: Checkpoint, slam: Slam, run: DiveRun, maps: OwnedMaps) -> Continued:
     """The dive as its checkpoint has it; where its frames and its time go on.
 
     Raises:

@@ -31,7 +31,7 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples
-from aquaflow.recordings.playback import Event, Playback, arrived
+from aquaflow.recordings.playback import Event, Playback, delay_event
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
@@ -67,7 +67,7 @@ class LatestSamples:
         self._latest[sample.source, type(sample).__name__] = sample, self._now_s()
         self._new.append(sample)
 
-    def taken(self) -> list[TelemetrySample]:
+    def take_new(self) -> list[TelemetrySample]:
         """Those that came since the last call, in the order of arrival, on the dive's clock."""
         shift_ns = self.shift_ns
         if shift_ns is None:
@@ -94,7 +94,7 @@ def _later(sample: TelemetrySample, by_ns: int) -> TelemetrySample:
 class HasDeviceClocks(Protocol):
     """A telemetry source whose devices have clocks of their own."""
 
-    def learned(self) -> Mapping[str, Learned]:
+    def learned_mappings(self) -> Mapping[str, Learned]:
         """The clock mappings learned so far, by device."""
         ...
 
@@ -292,12 +292,16 @@ class LiveFeed(_Pumps):
         frame = self.newest.take(timeout_s)
         if frame is None:
             return None
-        self.continued = self.continued.begun(frame.t_ns)
+        self.continued = self.continued.begin(frame.t_ns)
         self.latest_samples.shift_ns = self.continued.shift_ns
-        return self.continued.counted(frame)
+        return self.continued.count(frame)
 
     def clocks(self) -> Mapping[str, Learned]:
-        return self._telemetry.learned() if isinstance(self._telemetry, HasDeviceClocks) else {}
+        return (
+            self._telemetry.learned_mappings()
+            if isinstance(self._telemetry, HasDeviceClocks)
+            else {}
+        )
 
     def send(self, message: OutboundMessage) -> bool:
         return isinstance(self._telemetry, AcceptsMessages) and self._telemetry.send(message)
@@ -337,7 +341,7 @@ class LiveFeed(_Pumps):
 
     def _when_asked(self, frames: Iterator[Frame | Dropped]) -> Iterator[Frame | Dropped]:
         while not self.closing.is_set():
-            if self.newest.asked(ASK_S):
+            if self.newest.wait_for_consumer(ASK_S):
                 frame = next(frames, None)
                 if frame is None:
                     return
@@ -400,7 +404,7 @@ class PlaybackFeed(_Pumps):
             if self.closing.is_set():
                 break
             # Moments stay as recorded, so that frames.csv can be compared with a replay's.
-            now = arrived(event, 0, time.monotonic_ns())
+            now = delay_event(event, 0, time.monotonic_ns())
             if isinstance(now, (Frame, Dropped)):
                 self.newest.put(now)
             else:

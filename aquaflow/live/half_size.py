@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from aquaflow.render.views import View
 
 
-def halved(growth: Growth) -> Growth:
+def halve(growth: Growth) -> Growth:
     """The same growth at half the picture width."""
     view = growth.view
     width, height = view.camera.width // 2, view.camera.height // 2

@@ -17,7 +17,7 @@ from aquaflow.dive.run import Finished
 from aquaflow.live.checkpoint.repair import salvaged_from
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.control import ServiceControl
-from aquaflow.live.dive_parts import assembled, plain
+from aquaflow.live.dive_parts import assemble, plain
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import FINISHING
@@ -76,7 +76,7 @@ class LiveDive:
         self._finished = False
         losses = [] if salvaged is None else salvaged.losses
         try:
-            self.parts = assembled(
+            self.parts = assemble(
                 name, choice, feed, config, self.folder, self.vitals, self.control, losses
             )
         except BaseException:

@@ -17,7 +17,7 @@ from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.pressure import Need, Pressure, Shortage
-from aquaflow.live.health.state import Facts, Judgement, ServiceState, judged
+from aquaflow.live.health.state import Facts, Judgement, ServiceState, judge
 from aquaflow.live.map_thread import MapThread
 from aquaflow.live.service_health import ServiceHealth
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -94,7 +94,7 @@ class LiveLoop:
 
     def take(self, frame: Frame | Dropped | None) -> None:
         """One turn: a frame, the note that one is missing, or an idle moment."""
-        self.dive_run.samples(self.feed.latest_samples.taken())
+        self.dive_run.samples(self.feed.latest_samples.take_new())
         if frame is not None:
             self._frame_s, self._pictured = self._now_s(), True
         if self.control.paused:
@@ -116,7 +116,7 @@ class LiveLoop:
 
     def end(self) -> None:
         """After the last turn: telemetry of after the last frame is taken."""
-        self.dive_run.samples(self.feed.latest_samples.taken())
+        self.dive_run.samples(self.feed.latest_samples.take_new())
         self.heartbeats.retire(STAGE)
 
     def status(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ class LiveLoop:
             decided = self.dive_run.frame(frame)
         # A bad frame never ends the dive (docs/architecture.md#numbers-stay-finite).
         except Exception as error:
-            self._failed(frame, error)
+            self._record_failure(frame, error)
             return
         self._failed_in_a_row = 0
         self.counters.classes.update(tracked.frame_class.value for tracked in decided)
@@ -169,7 +169,7 @@ class LiveLoop:
         try:
             decided = self.dive_run.catch_up()
         except Exception as error:  # costs that frame
-            self._failed(past, error)
+            self._record_failure(past, error)
             return
         self.counters.classes.update(tracked.frame_class.value for tracked in decided)
 
@@ -181,7 +181,7 @@ class LiveLoop:
         elif tracked is None or tracked.frame_class is not FrameClass.SKIPPED:
             self._unposed += 1
 
-    def _failed(self, frame: Frame, error: Exception) -> None:
+    def _record_failure(self, frame: Frame, error: Exception) -> None:
         self.counters.failures += 1
         self._failed_in_a_row += 1
         log.exception("frame %d failed", frame.index)
@@ -203,7 +203,7 @@ class LiveLoop:
         with contain("health state"):
             paused = self.control.paused
             self.health.set(
-                *(Judgement(ServiceState.PAUSED, PAUSED) if paused else judged(self._facts()))
+                *(Judgement(ServiceState.PAUSED, PAUSED) if paused else judge(self._facts()))
             )
         self.tell_watchers()
         with contain("notification of systemd"):

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.live.half_size import halved
+from aquaflow.live.half_size import halve
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.mapping.work import Growth, Insertion, OwnedMaps, Progress
@@ -112,19 +112,19 @@ class MapThread:
     # --- what tracking asks for -----------------------------------------------------------------
 
     def grow(self, growth: Growth) -> None:
-        refused = self._refused(growth)
+        refused = self._refuse_growth(growth)
         if refused is not None:
             self.left_out[refused] += 1
             return
         level = self._level()
-        growth = replace(growth, retired=tuple(map(_owned, growth.retired)))
+        growth = replace(growth, retired=tuple(map(_own_pointmap, growth.retired)))
         if growth.view.robust and self._growing >= self._config.backlog:
             growth = replace(growth, steps=0)
             self.without_steps += 1
         if level >= DegradationLevel.FEWER_STEPS:
             growth = replace(growth, steps=growth.steps // FEWER)
         if level >= DegradationLevel.SMALLER_IMAGES:
-            growth = halved(growth)
+            growth = halve(growth)
         with self._changed:
             self._growing += growth.steps > 0
         self._post("grow", partial(self._grow, growth))
@@ -134,7 +134,7 @@ class MapThread:
             self._post("hold out", lambda maps: maps.hold_out(view, sub_map))
 
     def insert(self, insertion: Insertion) -> None:
-        self._post("insert", partial(_insert, _owned(insertion)))
+        self._post("insert", partial(_insert, _own_pointmap(insertion)))
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         self._post("correct", MapCorrection(moves, merged))
@@ -189,7 +189,7 @@ class MapThread:
 
     # --- the thread -----------------------------------------------------------------------------
 
-    def _refused(self, growth: Growth) -> str | None:
+    def _refuse_growth(self, growth: Growth) -> str | None:
         if self._level() >= DegradationLevel.TRACKING_ONLY:
             return "tracking only"
         backlog, waiting = self._config.backlog, self._growing
@@ -298,7 +298,7 @@ class MapThread:
             self._thread.join(JOIN_S)
 
 
-def _owned(insertion: Insertion) -> Insertion:
+def _own_pointmap(insertion: Insertion) -> Insertion:
     """With a pointmap of its own: tracking goes on fusing into that of a keyframe which it takes up
     again."""
     return replace(insertion, pointmap=insertion.pointmap.copy())

@@ -34,4 +34,4 @@ def record_mountings(
         known = mounting_of(camera)
         if name == mapped:
             known = camera_mounting(vehicle, vehicle.service, camera)
-        recorder.mounted(name, known)
+        recorder.record_mounting(name, known)

@@ -15,7 +15,7 @@ from aquaflow.base.storage.dive_status import DiveState, read_status
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.run import Finished
 from aquaflow.live.checkpoint.checkpoint import UnusableStateError
-from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
+from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resume_folder, tidy
 from aquaflow.live.checkpoint.set_aside import SetAside
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
@@ -114,7 +114,7 @@ class Onboard:
                 continue
             self._reason = IDLE
             finished = self._dive(asked, automatic)
-            control.ended()
+            control.end_dive()
             if not self._feed.lasting:
                 break
             self._feed.forget()
@@ -131,7 +131,7 @@ class Onboard:
         """Without a pilot's word: as the config says, and where a process was cut off in a dive."""
         if not self._feed.lasting or self._vehicle.service.dive.begin == "at_once":
             return True
-        choice = chosen(self._vehicle, asked)
+        choice = choose_dive_folder(self._vehicle, asked)
         status = read_status(choice.folder)
         interrupted = status is not None and status.state is DiveState.OPEN
         return choice.checkpoint is not None and interrupted
@@ -141,7 +141,7 @@ class Onboard:
         control, station, another = self._control, self._station, self._control.begin()
         asked = OnboardSettings(asked.out, asked.new or another, asked.overwrite)
         try:
-            dive = begun(self._feed, self._vehicle, asked, station.standby.vitals, control)
+            dive = begin_dive(self._feed, self._vehicle, asked, station.standby.vitals, control)
         except AquaFlowError as error:
             if automatic:
                 raise
@@ -153,11 +153,11 @@ class Onboard:
             station.show(dive)
             try:
                 dive.map()
-                return self._finished(dive)
+                return self._finish_dive(dive)
             finally:
                 station.hide()
 
-    def _finished(self, dive: LiveDive) -> Finished | None:
+    def _finish_dive(self, dive: LiveDive) -> Finished | None:
         """The end of a dive in a thread of its own, while the service goes on to answer."""
         control = self._control
         with ThreadPoolExecutor(1, "finishing") as threads:
@@ -180,7 +180,7 @@ class Onboard:
         self._reason = f"the last dive came to nothing: {error}"
 
 
-def begun(
+def begin_dive(
     feed: Feed,
     vehicle: VehicleConfig,
     asked: OnboardSettings,
@@ -194,7 +194,7 @@ def begun(
         AquaFlowError: the folder, or the config.
     """
     while True:
-        choice = chosen(vehicle, asked)
+        choice = choose_dive_folder(vehicle, asked)
         folder = choice.folder
         replaces = asked.overwrite or is_begun(folder)
         try:
@@ -210,10 +210,10 @@ def begun(
             asked = OnboardSettings(new=True)
 
 
-def chosen(vehicle: VehicleConfig, asked: OnboardSettings) -> Choice:
+def choose_dive_folder(vehicle: VehicleConfig, asked: OnboardSettings) -> Choice:
     """The folder, and what is resumed in it."""
     if asked.out is not None:
-        return Choice(asked.out) if asked.overwrite else resumed(asked.out, asked.new)
+        return Choice(asked.out) if asked.overwrite else resume_folder(asked.out, asked.new)
     service = vehicle.service
     choice = choose(service.dives, service.checkpoint, asked.new, ClockReading.now())
     tidy(service.dives, choice)

@@ -44,12 +44,12 @@ class NewestPicture:
             made = self._jpeg
             if made is not None and (made[0] is frame or now - self._made_s < SPACING_S):
                 return made[1]
-            self._jpeg, self._made_s = (frame, _encoded(frame)), now
+            self._jpeg, self._made_s = (frame, _encode(frame)), now
             self.encoded += 1
             return self._jpeg[1]
 
 
-def _encoded(frame: Frame) -> bytes:
+def _encode(frame: Frame) -> bytes:
     import cv2
 
     image = frame.image

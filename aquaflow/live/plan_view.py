@@ -53,11 +53,11 @@ class PlanView:
         """
         with self._lock:
             if self._now_s() - self._computed_s >= KEPT_S:
-                self._said = self._computed()
+                self._said = self._compute()
                 self._computed_s = self._now_s()
             return self._said
 
-    def _computed(self) -> dict[str, Any]:
+    def _compute(self) -> dict[str, Any]:
         parts = self._parts()
         if parts is None:
             return {"sub_maps": [], "now": None}
@@ -66,7 +66,7 @@ class PlanView:
         for keyframe in list(slam.keyframes.keyframes):  # tracking appends to it meanwhile
             centres.setdefault(keyframe.sub_map, []).append(keyframe.T_wc.t)
         plans = {
-            number: _SubMapPlan(slam.metric_frame(number), _thinned(own))
+            number: _SubMapPlan(slam.metric_frame(number), _thin(own))
             for number, own in sorted(centres.items())
         }
         now = None
@@ -111,7 +111,7 @@ class _SubMapPlan:
         }
 
 
-def _thinned(
+def _thin(
     centres: list[Array],  # each [3]
 ) -> Array:
     """[N, 3] at most MOST_POINTS of them, the first and the last among them."""

@@ -103,7 +103,7 @@ def report_between_dives(
 
 def _state(vitals: ServiceHealth, hang_s: float, now_s: float | None) -> dict[str, Any]:
     now = time.monotonic() if now_s is None else now_s
-    health, hung = vitals.health, vitals.heartbeats.hung(hang_s)
+    health, hung = vitals.health, vitals.heartbeats.find_hung_stage(hang_s)
     return {
         "version": __version__,
         "state": health.state.value,

@@ -55,22 +55,22 @@ class ServiceFrontends:
         self._viewer_config = vehicle.viewer
         with contextlib.ExitStack() as opened:
             if self._coverage is not None:
-                opened.callback(self._contained, self._coverage.close)
+                opened.callback(self._contain, self._coverage.close)
             if service.health.enabled:
                 plan = PlanView(self._dive_shown, coverage=self._coverage)
                 server = HealthServer(
                     service.health, self._page, plan.to_json, control, self.picture.jpeg,
                     self._coverage,
                 )  # fmt: skip
-                opened.callback(self._contained, server.close)
+                opened.callback(self._contain, server.close)
             if vehicle.viewer.enabled:
                 self._views.append(open_viewer(vehicle.viewer, self.report, self._coverage))
-                opened.callback(self._contained, self._views[-1].close)
+                opened.callback(self._contain, self._views[-1].close)
             if service.foxglove.enabled:
                 from aquaflow.live.foxglove.live import LiveFoxglove  # it loads torch
 
                 self._views.append(LiveFoxglove(service.foxglove, self.report))
-                opened.callback(self._contained, self._views[-1].close)
+                opened.callback(self._contain, self._views[-1].close)
             self._closing = opened.pop_all()
 
     def report(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ class ServiceFrontends:
         self.standby.end()
         self._closing.close()
 
-    def _contained(self, close: Callable[[], None]) -> None:
+    def _contain(self, close: Callable[[], None]) -> None:
         with self._feed.failures.contain("closing"):
             close()
 

@@ -25,7 +25,7 @@ class ServiceHealth:
         if state not in (ServiceState.STARTING, ServiceState.STOPPING):
             self.notifier.ready()
         self.notifier.status(f"{state.value}: {self.health.reason}")
-        if self.heartbeats.hung(self.hang_s) is None:
+        if self.heartbeats.find_hung_stage(self.hang_s) is None:
             self.notifier.alive()
 
     def stop(self, reason: str, seconds: float) -> None:

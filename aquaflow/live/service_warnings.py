@@ -50,7 +50,7 @@ def of_the_stages(maps: MapThread, failures: Failures) -> list[ServiceWarning]:
         troubles.append(
             ServiceWarning(f"mapping fails: {maps.last_failure}", sentences.MAPPING_FAILS)
         )
-    troubles += [ServiceWarning(each, sentences.STAGE_FAILS) for each in failures.repeated()]
+    troubles += [ServiceWarning(each, sentences.STAGE_FAILS) for each in failures.list_repeated()]
     return troubles
 
 

@@ -65,7 +65,7 @@ class DeviceWork:
         """Do ``work`` on map ``number``, with these arguments after the map, which is another one
         once its device is lost; what it raises is counted, for ``frame``, and False returned."""
         may_be_left_out = stage in MAY_BE_LEFT_OUT
-        attempt = partial(self._tried, stage, number, frame, work, *args, **kwargs)
+        attempt = partial(self._attempt, stage, number, frame, work, *args, **kwargs)
         error = attempt()
         if error is not None and self._is_of_device(error):
             full = is_device_full(error)
@@ -92,7 +92,7 @@ class DeviceWork:
     ) -> bool:
         """A change that is made wholly, and once: a map that a failing device left half changed
         goes on from its copy, which is of before."""
-        attempt = partial(self._tried, stage, number, None, work, *args, **kwargs)
+        attempt = partial(self._attempt, stage, number, None, work, *args, **kwargs)
         error = attempt()
         if error is not None and self._is_of_device(error):
             self.leave_device(first_line(error), half_changed=number)
@@ -104,11 +104,11 @@ class DeviceWork:
     def move(self, number: int, moves: Mapping[int, Sim3]) -> None:
         """Map ``number`` follows its keyframes, and so does its copy."""
         if self.change("correction of the map", number, Mapper.move, moves):
-            self._copies.moved(number, moves)
+            self._copies.follow_moves(number, moves)
 
     def copy_grown(self, number: int) -> None:
         """Map ``number`` has grown by a view; now and then it is copied."""
-        self.do("copy of the map", number, None, lambda mapper: self._copies.grown(number, mapper))
+        self.do("copy of the map", number, None, lambda mapper: self._copies.grow(number, mapper))
 
     def copy(self, number: int) -> None:
         """Copy map ``number``, as it would go on without its device."""
@@ -134,7 +134,7 @@ class DeviceWork:
                 raise
             self.leave_device(first_line(error))  # where every map is made whole
 
-    def _tried(
+    def _attempt(
         self,
         stage: str,
         number: int,

@@ -35,7 +35,7 @@ class HostCopies:
         """By map, the corrections since its copy."""
         self._grown: Counter[int] = Counter()
 
-    def grown(self, number: int, mapper: Mapper) -> None:
+    def grow(self, number: int, mapper: Mapper) -> None:
         """Map ``number`` has grown by a view; now and then that is worth a copy."""
         if self._grown[number] % COPY_EVERY == 0:
             self.take(number, mapper)
@@ -47,7 +47,7 @@ class HostCopies:
             self._copies[number] = serialise(mapper, optimiser=True)
             self._moves[number] = []
 
-    def moved(self, number: int, moves: Mapping[int, Sim3]) -> None:
+    def follow_moves(self, number: int, moves: Mapping[int, Sim3]) -> None:
         """Map ``number`` has followed its keyframes, and its copy is to follow too."""
         if number in self._copies and moves:
             self._moves[number].append(moves)

@@ -31,7 +31,7 @@ class MapCopy:
 
 
 @torch.no_grad()
-def copied(mapper: Mapper) -> MapCopy:
+def copy_map(mapper: Mapper) -> MapCopy:
     """In the mapping thread: a copy; a tenth of a second for 150,000 Gaussians."""
     tensors = mapper.gaussians.parameters
     plain = {name: map_out(tensor) for name, tensor in tensors.items()}
@@ -40,7 +40,7 @@ def copied(mapper: Mapper) -> MapCopy:
     water = mapper.scene.water(view)
     rows = None
     if water is not None:
-        rows = map_out(torch.cat([water.stacked(), mapper.scene.white_gain()[None]]))
+        rows = map_out(torch.cat([water.stack(), mapper.scene.white_gain()[None]]))
     steps = map_out(mapper.optimiser.adam.steps)
     poses = [each.T_wc for each in mapper.views]
     return MapCopy(plain, steps, map_out(clear), rows, poses)

@@ -15,6 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.gaussians.insertion import (
+    COVERED_ALPHA,
     alpha_where_agreed,
     colour_range,
     insertion_probability,
@@ -43,6 +44,10 @@ MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""
 MOST_FULL = 3
 """Steps in a row that find the device's memory full until no further one is tried."""
+KNOWN_SIGMA = 0.15
+"""Relative range sigma of pixels that may get a Gaussian."""
+NEWEST_SHARE = 0.2
+"""Share of the steps on the newest view (ARTDECO)."""
 
 
 class Mapper:
@@ -99,7 +104,7 @@ class Mapper:
         self._take(view)
 
         # The range of every pixel as tracked; the view keeps it for the depth loss (Eq. 21).
-        tracked = tracked_range(pointmap, config.known_sigma)
+        tracked = tracked_range(pointmap, KNOWN_SIGMA)
         tracked.keep_in(view)
         tracked = tracked.on(self.device)
         tracked_z = tracked.z * view.T_wc.scale
@@ -108,7 +113,7 @@ class Mapper:
         shown = self.scene.show(view, learn=True)
 
         # Eq. 16: J-hat, the picture without the medium, over the tracked range or the map's.
-        covered = shown.alpha > config.covered_alpha
+        covered = shown.alpha > COVERED_ALPHA
         z = torch.where(tracked.known, tracked_z, torch.where(covered, shown.z, 0.0))
         J_hat, recoverable = self._restore(view, colour_range(z, shown.z, covered, config))
 
@@ -121,7 +126,7 @@ class Mapper:
         rows, columns = select(P_a, allowed, config, self._random)
 
         # Room for them below the hard cap.
-        rows, columns = self._make_room(rows, columns, agreed_alpha < config.covered_alpha)
+        rows, columns = self._make_room(rows, columns, agreed_alpha < COVERED_ALPHA)
 
         # Gaussians on the rays of these pixels.
         if len(rows) == 0:
@@ -175,7 +180,7 @@ class Mapper:
         if self.neural is not None:
             self.neural.move(moved)
         move_views(self.views, moves)
-        self.water_fitting.moved(moves)
+        self.water_fitting.follow_moves(moves)
 
     def use_unit(self, metres_per_unit: float) -> None:
         """The map's unit is known in metres; a decoder's voxels may be given in them."""
@@ -204,8 +209,7 @@ class Mapper:
         """Steps on the newest view now and then, else on any (paper, Sec. 3.4)."""
         if len(self.gaussians) == 0:
             return
-        share = self.config.optimiser.newest_share
-        chosen = sampled_views(self.views, steps, share, self._random)
+        chosen = sampled_views(self.views, steps, NEWEST_SHARE, self._random)
         self.scene.centre_water(self.views)
         with self.scene.learning_from(chosen):
             for view in chosen:

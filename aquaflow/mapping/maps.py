@@ -12,7 +12,15 @@ from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.profiler import Profiler
 from aquaflow.config import Config
-from aquaflow.geometry.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
+from aquaflow.geometry.arrays import (
+    Arrays,
+    add_prefix,
+    of_camera,
+    of_sim3,
+    to_camera,
+    to_sim3,
+    under,
+)
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import state
 from aquaflow.mapping.device_work import DeviceWork
@@ -161,14 +169,14 @@ class Maps:
         return self.views.lost
 
     def serialise(self) -> tuple[dict[str, Any], Arrays]:
-        return serialised(self.mappers, self.held_out)
+        return serialise(self.mappers, self.held_out)
 
     def restore(
         self,
         facts: dict[str, Any],
         arrays: Arrays,  # as from serialise
     ) -> None:
-        mappers, held_out = restored(facts, arrays, self.renderer, self.failures)
+        mappers, held_out = restore(facts, arrays, self.renderer, self.failures)
         for number, mapper in mappers.items():
             mapper.views = self.views.restore(mapper.views)
             self.mappers[number] = mapper
@@ -211,7 +219,7 @@ def drop_surplus(
 # All maps of a dive as facts and arrays, for a checkpoint; their pictures are stored apart.
 
 
-def serialised(
+def serialise(
     mappers: Mapping[int, Mapper], held_out: Mapping[int, Sequence[View]]
 ) -> tuple[dict[str, Any], Arrays]:
     """Facts for JSON, and arrays, which are copies; both arguments are by sub-map."""
@@ -219,14 +227,14 @@ def serialised(
     arrays: Arrays = {}
     for number, mapper in mappers.items():
         facts["maps"][str(number)], parts = state.serialise(mapper, optimiser=True)
-        arrays |= prefixed(f"map{number}", parts)
+        arrays |= add_prefix(f"map{number}", parts)
     for number, views in held_out.items():
         facts["held_out"][str(number)], parts = _held_out(views)
-        arrays |= prefixed(f"held_out{number}", parts)
+        arrays |= add_prefix(f"held_out{number}", parts)
     return facts, arrays
 
 
-def restored(
+def restore(
     facts: dict[str, Any],
     arrays: Arrays,  # as from serialised
     renderer: Renderer,

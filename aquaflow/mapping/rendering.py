@@ -73,6 +73,6 @@ def show(
         image = clean if gain is None else clean * gain[..., None]
     else:
         image, z = compose_water(
-            drawn.image, drawn.alpha, water.stacked(), renderer.threads, uneven, gain
+            drawn.image, drawn.alpha, water.stack(), renderer.threads, uneven, gain
         )
     return RenderedMap(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)

@@ -151,11 +151,11 @@ class Scene:
             return self.gaussians.parameters
         return self.neural.seen_from(view, viewmat)
 
-    def baked(self, views: list[View]) -> Mapping[str, Tensor]:
+    def bake_parameters(self, views: list[View]) -> Mapping[str, Tensor]:
         """The parameters as plain Gaussians, each as seen from the nearest of ``views``."""
         if self.neural is None or not views:
             return self.gaussians.parameters
-        return self.neural.baked(self.nearest_cameras(views)[0])
+        return self.neural.bake_parameters(self.nearest_cameras(views)[0])
 
     @torch.no_grad()
     def bake(self, views: list[View]) -> Tensor:
@@ -168,7 +168,7 @@ class Scene:
             return torch.zeros_like(self.gaussians.means)
         centres = self.nearest_cameras(views)[0]
         if self.neural is not None:
-            baked = self.neural.baked(centres)
+            baked = self.neural.bake_parameters(centres)
             for name, tensor in self.gaussians.parameters.items():
                 tensor.copy_(baked[name])
             self.neural = None
@@ -222,7 +222,7 @@ class Scene:
         return image if light is None else image / light
 
     @torch.no_grad()
-    def recovered(
+    def recover(
         self,
         view: View,
         lit: Tensor,  # [H, W, 3] its picture, evenly lit
@@ -257,7 +257,7 @@ class Scene:
         return water_in(found, self.device, torch.bool) & view.scene_mask()
 
     @torch.no_grad()
-    def balanced(
+    def apply_white_balance(
         self,
         radiance: Tensor,  # [..., 3] J
     ) -> Tensor:

@@ -106,7 +106,10 @@ def _adopt(
 
     The same from the camera nearest to it: where it is seen best.
     """
-    shown, (_, z, nearest) = scene.baked(list(fitted))["raw_colours"], scene.nearest_cameras(fitted)
+    shown, (_, z, nearest) = (
+        scene.bake_parameters(list(fitted))["raw_colours"],
+        scene.nearest_cameras(fitted),
+    )
     old = _water_of(scene, fitted, nearest) if scene.medium.active else None
     old_gains = torch.stack([gain_of(view) for view in fitted])
     scene.medium.active = estimate.model.water

@@ -18,7 +18,16 @@ from torch import Tensor
 from aquaflow.base.errors import DamagedError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
-from aquaflow.geometry.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
+from aquaflow.config.old_keys import without_old_keys
+from aquaflow.geometry.arrays import (
+    Arrays,
+    add_prefix,
+    of_camera,
+    of_sim3,
+    to_camera,
+    to_sim3,
+    under,
+)
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural.neural import NeuralGaussians
@@ -56,10 +65,10 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "undone": mapper.undone,
         "cameras": [of_camera(camera) for camera in cameras],
     }
-    arrays = _prefixed("gaussians", mapper.gaussians.parameters)
+    arrays = _prefix("gaussians", mapper.gaussians.parameters)
     arrays["keyframes"] = checkpoint_out(mapper.gaussians.keyframes)
     arrays["shading"] = scene.shading.copy()
-    arrays |= _prefixed("medium", mapper.medium.state_dict())
+    arrays |= _prefix("medium", mapper.medium.state_dict())
     arrays |= _views(mapper.views, cameras)
     if mapper.neural is not None:
         arrays |= _decoder(mapper.neural)
@@ -81,7 +90,8 @@ def deserialise(
     Raises:
         KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.
     """
-    mapper = Mapper(MappingConfig.model_validate(facts["config"]), renderer, 0, failures)
+    config = without_old_keys({"mapping": facts["config"]}, "the map")["mapping"]
+    mapper = Mapper(MappingConfig.model_validate(config), renderer, 0, failures)
     scene, gaussians, device = mapper.scene, mapper.gaussians, mapper.device
     for name, width in gaussians.WIDTHS.items():
         values = checkpoint_in(arrays[f"gaussians.{name}"], device)
@@ -168,8 +178,8 @@ def _read_views(
 def _decoder(neural: NeuralGaussians) -> Arrays:
     neural.settle()
     groups = neural.groups
-    arrays = _prefixed("decoder", neural.decoder.state_dict())
-    arrays |= _prefixed("groups", {name: getattr(groups, name) for name in GROUPS})
+    arrays = _prefix("decoder", neural.decoder.state_dict())
+    arrays |= _prefix("groups", {name: getattr(groups, name) for name in GROUPS})
     arrays["voxel_size"] = np.array(groups.size)
     arrays["groups.order"] = checkpoint_out(groups.order())
     arrays["local"] = checkpoint_out(neural.gaussians.local_features)
@@ -208,11 +218,11 @@ def _optimisers(mapper: Mapper) -> Arrays:
     arrays: Arrays = {"random": mapper._random.get_state().numpy().copy()}
     for name, adam in _adams(mapper).items():
         arrays[f"{name}.steps"] = checkpoint_out(adam.steps)
-        arrays |= _prefixed(f"{name}.first", adam.first_moments)
-        arrays |= _prefixed(f"{name}.second", adam.second_moments)
+        arrays |= _prefix(f"{name}.first", adam.first_moments)
+        arrays |= _prefix(f"{name}.second", adam.second_moments)
     for name, optimiser in _dense(mapper).items():
         for i, state in optimiser.state.items():
-            arrays |= _prefixed(f"{name}.{i}", state)
+            arrays |= _prefix(f"{name}.{i}", state)
     return arrays
 
 
@@ -239,14 +249,14 @@ def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) ->
 # --- arrays ---------------------------------------------------------------------------------------
 
 
-def _prefixed(
+def _prefix(
     prefix: str,
     tensors: Mapping[str, Tensor],  # of any shape
 ) -> Arrays:
     """Copies, as arrays."""
-    return prefixed(prefix, {name: checkpoint_out(tensor) for name, tensor in tensors.items()})
+    return add_prefix(prefix, {name: checkpoint_out(tensor) for name, tensor in tensors.items()})
 
 
 def _under(prefix: str, arrays: Mapping[str, Any], device: torch.device) -> dict[str, Tensor]:
-    """What :func:`_prefixed` put there."""
+    """What :func:`_prefix` put there."""
     return {name: checkpoint_in(array, device) for name, array in under(prefix, arrays).items()}

@@ -15,7 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import adopt_water, fitting_water
 from aquaflow.render.views import View, in_time
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 
 log = logging.getLogger(__name__)
 
@@ -59,10 +59,10 @@ class WaterFitting:
     def at_once(self, views: Sequence[View]) -> None:
         """A whole fit, from its beginning."""
         with self.failures.contain("water fit"):
-            finished(self._fitting(views))
+            run_to_end(self._fitting(views))
         self._end(views)
 
-    def moved(self, moves: Mapping[int, Sim3]) -> None:
+    def follow_moves(self, moves: Mapping[int, Sim3]) -> None:
         """Keyframes have moved: a fit under way begins again if the map's unit did."""
         if any(abs(move.scale - 1.0) > OTHER_UNIT for move in moves.values()):
             self.begin_again()

@@ -2,7 +2,7 @@
 
 Fitting from coarse to fine takes half the time of a second DIS flow. A match that was wrong is not
 confirmed by it: what is reversed there fits nothing, or something else
-(docs/measurements.md#backward).
+(notes/measurements.md#backward).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.prior.fields import halved, of_size, pixel_grid, sample
+from aquaflow.prior.fields import halve, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import refine
 
 Float = npt.NDArray[np.float32]
@@ -47,7 +47,7 @@ def backward_flow(
     pictures = [(b, a)]
     for _ in range(HALVINGS):
         finer_b, finer_a = pictures[-1]
-        pictures.append((halved(finer_b), halved(finer_a)))
+        pictures.append((halve(finer_b), halve(finer_a)))
     # What is finer than the coarsest picture is found anew in the finer ones.
     flow = reverse(of_size(forward, pictures[-1][0].shape))
     for coarse_b, coarse_a in reversed(pictures):

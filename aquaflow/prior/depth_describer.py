@@ -18,7 +18,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float
 from aquaflow.prior.depth_card import NETWORK, UNITS, DepthCard
 from aquaflow.prior.folder import CARD, read_card
-from aquaflow.prior.framing import ImagePadding, as_input, multiple_of, resized
+from aquaflow.prior.framing import ImagePadding, as_input, multiple_of, resize
 from aquaflow.prior.learned_range import LearnedRange, cell_rays
 from aquaflow.prior.network import METRIC_SIGMA, Half, Picture
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
@@ -55,7 +55,7 @@ class DepthDescriber:
         self._frame = (sides[0], sides[1]) if len(sides) == 2 else None
         self._views = (1,) * (len(shape) - 4)
 
-    def fitted(
+    def fit(
         self,
         image: Picture,  # [H, W, 3] RGB
     ) -> Picture:
@@ -63,16 +63,16 @@ class DepthDescriber:
         as many pixels as the card says."""
         height, width = image.shape[:2]
         if self._frame is not None:
-            return self._framing(height, width).framed(image)
+            return self._framing(height, width).frame(image)
         scale, step = (self._pixels / (height * width)) ** 0.5, self._card.multiple_px
-        return resized(image, multiple_of(scale * height, step), multiple_of(scale * width, step))
+        return resize(image, multiple_of(scale * height, step), multiple_of(scale * width, step))
 
     def features(
         self,
         picture: Picture,  # [h, w, 3] as fitted
     ) -> Half:
         """[h', w', 2] logarithms of depth and of its relative sigma; NaN where unknown."""
-        found = self._network({self._card.input: self._normalised(picture)})
+        found = self._network({self._card.input: self._normalise(picture)})
         log_depth = self._log_depth(_plane(found, self._card.output))
         log_sigma = np.full_like(log_depth, np.log(self._card.relative_error))
         if self._card.confidence is not None:
@@ -80,7 +80,7 @@ class DepthDescriber:
         with np.errstate(over="ignore"):  # becomes infinite, and so unknown
             return np.stack([log_depth, log_sigma], -1).astype(np.float16)
 
-    def compared(
+    def compare(
         self,
         a: Half,  # [h', w', 2]
         b: Half,  # [h', w', 2]
@@ -107,7 +107,7 @@ class DepthDescriber:
         assert self._frame is not None
         return ImagePadding.of(height, width, self._frame, self._card.multiple_px)
 
-    def _normalised(
+    def _normalise(
         self,
         picture: Picture,  # [h, w, 3]
     ) -> npt.NDArray[np.float32]:

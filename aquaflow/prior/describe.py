@@ -101,18 +101,18 @@ def describe(
             metric=depth.unit == "metres",
             licence=licence,
             opset=0,
-            files=_copied(network, folder),
+            files=_copy(network, folder),
             parity={},
             depth=depth,
         )
         write_card(folder, card)
-        return _tried(folder, card)
+        return _try_prior(folder, card)
     except BaseException:  # also when interrupted: half a folder would be in the way of the next
         shutil.rmtree(folder)
         raise
 
 
-def _copied(network: Path, folder: Path) -> dict[str, str]:
+def _copy(network: Path, folder: Path) -> dict[str, str]:
     """Checksums of the network and of weights that lie in a file of their own."""
     shutil.copyfile(network, folder / NETWORK)
     names = [NETWORK]
@@ -124,9 +124,9 @@ def _copied(network: Path, folder: Path) -> dict[str, str]:
     return {name: sha256_of(folder / name) for name in names}
 
 
-def _tried(folder: Path, card: PriorCard) -> Described:
+def _try_prior(folder: Path, card: PriorCard) -> Described:
     describer = DepthDescriber(folder, CPU)
-    picture = describer.fitted(example_picture(card.height, card.width))
+    picture = describer.fit(example_picture(card.height, card.width))
     height, width = picture.shape[:2]
     before = time.perf_counter()
     try:

@@ -15,7 +15,7 @@ from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.depth_describer import DepthDescriber
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.framing import as_input, multiple_of, resized
+from aquaflow.prior.framing import as_input, multiple_of, resize
 from aquaflow.prior.learned_range import MOST_LOG, LearnedRange, cell_rays
 from aquaflow.prior.mast3r.describer import Mast3rDescriber
 from aquaflow.prior.network import Describer, Half, Picture, unit
@@ -33,7 +33,7 @@ class CompactDescriber:
     range_unit: RangeUnit = "shared"
     unit_sigma = float("inf")
     """It was trained on pairs whose scale was taken out: where the scene is twice as far, its range
-    stays nearly the same (docs/measurements.md#learned-depth)."""
+    stays nearly the same (notes/measurements.md#learned-depth)."""
 
     def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
         """Load the exported ``folder``.
@@ -50,7 +50,7 @@ class CompactDescriber:
         [(self._input, shape)] = self._encoder.inputs.items()
         self._fixed = shape[2:] if all(isinstance(n, int) for n in shape[2:]) else None
 
-    def fitted(
+    def fit(
         self,
         image: Picture,  # [H, W, 3] RGB
     ) -> Picture:
@@ -61,7 +61,7 @@ class CompactDescriber:
         else:
             scale = min((self._pixels / (height * width)) ** 0.5, 1.0)
             height, width = (multiple_of(scale * side, MULTIPLE_PX) for side in (height, width))
-        return resized(image, height, width)
+        return resize(image, height, width)
 
     def features(
         self,
@@ -71,7 +71,7 @@ class CompactDescriber:
         found = self._encoder({self._input: as_input(picture)})["Dc"][0]
         return np.ascontiguousarray(unit(found.transpose(1, 2, 0)).astype(np.float16))
 
-    def compared(
+    def compare(
         self,
         a: Half,  # [h / 8, w / 8, d]
         b: Half,  # [h / 8, w / 8, d]
@@ -81,7 +81,7 @@ class CompactDescriber:
         """Descriptors are the features themselves; ranges come from comparing rays."""
         return CompactPair(self, a, b, camera_a, camera_b)
 
-    def decoded(
+    def decode(
         self,
         a: Half,  # [h / 8, w / 8, d]
         b: Half,  # [h / 8, w / 8, d]
@@ -106,7 +106,7 @@ class CompactDescriber:
 @dataclass
 class CompactPair:
     """Two pictures that the compact network compared. Ranges are nearly monocular, and up to a
-    factor; its C makes poses no better (docs/measurements.md#compact-prior)."""
+    factor; its C makes poses no better (notes/measurements.md#compact-prior)."""
 
     describer: CompactDescriber
     a: Half
@@ -139,7 +139,7 @@ class CompactPair:
 
     @cached_property
     def _decoded(self) -> dict[str, Float]:
-        return self.describer.decoded(self.a, self.b, self.camera_a, self.camera_b)
+        return self.describer.decode(self.a, self.b, self.camera_a, self.camera_b)
 
 
 def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> NetworkSession:

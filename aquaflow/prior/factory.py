@@ -39,11 +39,11 @@ def make_prior(config: PriorConfig) -> Prior:
         InputError: the asked-for folder is no prior, or a file in it was changed.
         AquaFlowError: the processor asked for, or a keypoint network's package, is not there.
     """
-    prior = _chosen(config)
+    prior = _choose(config)
     return prior if config.confidence else UnweightedPrior(prior)
 
 
-def _chosen(config: PriorConfig) -> Prior:
+def _choose(config: PriorConfig) -> Prior:
     if config.kind == "classical":
         return ClassicalPrior()
     if config.kind in ("xfeat", "aliked"):

@@ -38,7 +38,7 @@ def sample(
     )
 
 
-def halved(
+def halve(
     grey: npt.NDArray[np.uint8],  # [H, W]
 ) -> npt.NDArray[np.uint8]:
     """[H / 2, W / 2] the picture, smoothed and of half the size, rounded up."""

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.backward_flow import backward_flow, reverse
-from aquaflow.prior.fields import half_by_area, halved, length, of_size, pixel_grid, sample
+from aquaflow.prior.fields import half_by_area, halve, length, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import is_refinable, refine
 from aquaflow.render.library import library_or_none
 
@@ -24,7 +24,7 @@ FILL_PX = 31
 CLAHE_CLIP = 2.0
 """OpenCV's clip limit of the histogram in each tile."""
 CLAHE_TILES = (8, 8)
-"""Local contrast normalisation: water takes contrast unevenly (docs/measurements.md)."""
+"""Local contrast normalisation: water takes contrast unevenly (notes/measurements.md)."""
 
 FORWARD_BACKWARD_PX = 1.0
 """A match that does not come back to within a pixel is occluded, out of view or wrong."""
@@ -52,7 +52,7 @@ MIN_TEXTURE = 30.0
 QUARTER_SCALE = 2
 """DIS is given pictures halved so often where the last matches are known; its matches are then
 fitted at half and at all of the size. To half the size DIS costs three times as much, and
-trajectories are no more accurate (docs/measurements.md#seeded)."""
+trajectories are no more accurate (notes/measurements.md#seeded)."""
 
 HALF_SIZE_FITS = 2
 """Times that such a flow is fitted at half the size: once, trajectories err by a quarter more."""
@@ -234,7 +234,7 @@ class FlowMatcher:
         start: Float,  # [H, W, 2] px, a to b
     ) -> Float:
         """DIS down to a quarter of the size, fitted at half of it."""
-        half_a, half_b = halved(a), halved(b)
+        half_a, half_b = halve(a), halve(b)
         small_a, small_b = a, b
         for _ in range(QUARTER_SCALE):
             small_a, small_b = half_by_area(small_a), half_by_area(small_b)

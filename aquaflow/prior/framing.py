@@ -47,13 +47,13 @@ class ImagePadding:
         ]
         return ImagePadding(*frame, *before, *inner)
 
-    def framed(
+    def frame(
         self,
         image: Picture,  # [H, W, 3]
     ) -> Picture:
         """[frame_height, frame_width, 3]"""
         framed = np.full((self.frame_height, self.frame_width, 3), GREY, np.uint8)
-        inside = resized(image, self.height, self.width)
+        inside = resize(image, self.height, self.width)
         framed[self.top : self.top + self.height, self.left : self.left + self.width] = inside
         return framed
 
@@ -75,7 +75,7 @@ def as_input(
     return np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32) / 255.0
 
 
-def resized(
+def resize(
     image: Picture,  # [H, W, 3]
     height: int,
     width: int,

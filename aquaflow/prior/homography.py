@@ -13,7 +13,7 @@ from aquaflow.prior.flow import Float, Grey
 SIFT_FEATURES = 2000
 """Strongest keypoints of a picture that are kept."""
 SIFT_CONTRAST = 0.015
-"""Below OpenCV's 0.04: water lowers contrast (docs/measurements.md#initialisation)."""
+"""Below OpenCV's 0.04: water lowers contrast (notes/measurements.md#initialisation)."""
 LOWE_RATIO = 0.8
 """Best over second-best distance of a match that is accepted (D. Lowe, IJCV 2004: 0.8)."""
 RANSAC_PX = 4.0

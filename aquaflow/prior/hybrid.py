@@ -3,7 +3,7 @@
 A network distinguishes the cells of a picture, whatever the water, the light and the
 distance did to it; but cells are coarse. Dense flow is exact to a fifth of a pixel, but only finds
 what is near its start. So flow starts at the descriptors' matches
-(docs/measurements.md#compact-prior).
+(notes/measurements.md#compact-prior).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class LazyComparison:
     def found(self) -> ComparedPair:
         """What the network says of the pair."""
         a, b = self._a, self._b
-        return a.describer.compared(a.features, b.features, a.camera, b.camera)
+        return a.describer.compare(a.features, b.features, a.camera, b.camera)
 
     @property
     def asked(self) -> bool:
@@ -148,7 +148,7 @@ class HybridPrior(FlowPrior):
     ) -> HybridEncoding:
         """What dense flow and the network's comparison need of a picture."""
         grey = dense.normalised_grey(image, mask)
-        fitted, texture = self._describer.fitted(image), dense.texture(grey, mask)
+        fitted, texture = self._describer.fit(image), dense.texture(grey, mask)
         return HybridEncoding(camera, grey, texture, fitted, self._describer, mask=mask)
 
     def unpack(
@@ -180,10 +180,10 @@ class HybridPrior(FlowPrior):
 
     def warm_up(self) -> None:
         """Run the network once: the first picture of a dive then waits for no preparation."""
-        features = self._describer.features(self._describer.fitted(np.zeros(WARM_UP, np.uint8)))
+        features = self._describer.features(self._describer.fit(np.zeros(WARM_UP, np.uint8)))
         height, width, _ = WARM_UP
         camera = CameraModel(width, height, width, width, 0.5 * width, 0.5 * height)
-        learned_range = self._describer.compared(features, features, camera, camera).range_a
+        learned_range = self._describer.compare(features, features, camera, camera).range_a
         learned_range.pointmap(camera)
 
 

@@ -56,7 +56,7 @@ class Describer(Protocol):
     unit_sigma: float
     """As of the prior."""
 
-    def fitted(
+    def fit(
         self,
         image: Picture,  # [H, W, 3] RGB
     ) -> Picture:
@@ -70,7 +70,7 @@ class Describer(Protocol):
         """What is computed once for a picture and kept with it."""
         ...
 
-    def compared(
+    def compare(
         self,
         a: Half,  # [...] features of one picture
         b: Half,  # [...] of the other

@@ -123,7 +123,7 @@ class OracleDescriber:
         self._directions = rng.normal(size=(3, FEATURES // 2)) / self._width
         self._phases = rng.uniform(0.0, 2.0 * np.pi, FEATURES // 2)
 
-    def fitted(
+    def fit(
         self,
         image: Picture,  # [H, W, 3]
     ) -> Picture:
@@ -142,7 +142,7 @@ class OracleDescriber:
         waves = np.concatenate([np.cos(phase), np.sin(phase)], -1) * (2.0 / FEATURES) ** 0.5
         return np.concatenate([waves, self._log_range[number][..., None]], -1).astype(np.float16)
 
-    def compared(
+    def compare(
         self,
         a: Half,  # [h, w, FEATURES + 1]
         b: Half,  # [h, w, FEATURES + 1]

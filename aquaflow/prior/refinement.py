@@ -90,11 +90,11 @@ def refine_by_opencv(
     # One array for each coordinate, as OpenCV's gradients and remap want them.
     u, v = flow[..., 0].copy(), flow[..., 1].copy()
     here = _contrast_normalised(a.astype(np.float32))
-    there = _contrast_normalised(_warped(b, u, v))
+    there = _contrast_normalised(_warp(b, u, v))
     gx, gy = _gradient(0.5 * (here + there))
     left = here - there
-    xx, yy, xy = _windowed(gx * gx), _windowed(gy * gy), _windowed(gx * gy)
-    xe, ye = _windowed(gx * left), _windowed(gy * left)
+    xx, yy, xy = _window(gx * gx), _window(gy * gy), _window(gx * gy)
+    xe, ye = _window(gx * left), _window(gy * left)
     damping = SINGULAR * (xx + yy) + 1e-6
     xx, yy = xx + damping, yy + damping
     inverse = 1.0 / (xx * yy - xy * xy)
@@ -106,7 +106,7 @@ def refine_by_opencv(
     return np.stack([u + x * shorten, v + y * shorten], -1)
 
 
-def _warped(
+def _warp(
     b: Grey,  # [H, W]
     u: Float,  # [H, W] px
     v: Float,  # [H, W] px
@@ -129,7 +129,7 @@ def _contrast_normalised(
     return np.asarray((grey - mean) / np.sqrt(variance + GREY_NOISE**2), dtype=np.float32)
 
 
-def _windowed(
+def _window(
     field: Float,  # [H, W]
 ) -> Float:
     size = (WINDOW_PX, WINDOW_PX)

@@ -87,7 +87,7 @@ class NetworkSession:
             raise InputError(
                 f"{path} cannot be run ({reason_of(error)}); export it again"
             ) from error
-        self.device = _obtained(ort, self._session, device, settings.device, path.name)
+        self.device = _obtain(ort, self._session, device, settings.device, path.name)
         self.inputs = {value.name: tuple(value.shape) for value in self._session.get_inputs()}
         """Shape of each; a name in it is a size that may change."""
         self.outputs = [value.name for value in self._session.get_outputs()]
@@ -192,7 +192,7 @@ def _not_loading(ort: Any, device: str) -> str:
     return ""
 
 
-def _obtained(ort: Any, session: Any, wanted: str, asked: Device, what: str) -> str:
+def _obtain(ort: Any, session: Any, wanted: str, asked: Device, what: str) -> str:
     """The processor that the session runs on; a library that does not load makes it a slower one.
 
     Raises:

@@ -39,8 +39,8 @@ def differences(folder: Path, settings: RuntimeSettings) -> dict[str, float]:
         InputError: no prior, changed files, or no network of that precision.
         AquaFlowError: the processor or the precision cannot be had.
     """
-    expected = _said(folder, RuntimeSettings(device="cpu", precision="fp32"))
-    found = _said(folder, settings)
+    expected = _run_network(folder, RuntimeSettings(device="cpu", precision="fp32"))
+    found = _run_network(folder, settings)
     return {name: difference(expected[name], found[name], _scale(name)) for name in expected}
 
 
@@ -76,15 +76,15 @@ def difference(
     return float(distance.max()) / max(largest, float(np.finfo(np.float32).tiny))
 
 
-def _said(folder: Path, settings: RuntimeSettings) -> dict[str, Array]:
+def _run_network(folder: Path, settings: RuntimeSettings) -> dict[str, Array]:
     """Outputs by name."""
     card, describer = read_card(folder), describer_in(folder, settings)
     wide = example_picture(card.height, card.width + MOVED_PX)
     pictures = [np.ascontiguousarray(wide[:, :-MOVED_PX]), np.ascontiguousarray(wide[:, MOVED_PX:])]
-    a, b = (describer.features(describer.fitted(picture)) for picture in pictures)
+    a, b = (describer.features(describer.fit(picture)) for picture in pictures)
     width, height = card.width, card.height
     camera = CameraModel(width, height, width, width, 0.5 * width, 0.5 * height)
-    pair = describer.compared(a, b, camera, camera)
+    pair = describer.compare(a, b, camera, camera)
     said: dict[str, Array] = {"features_a": a, "features_b": b}
     if pair.cells is not None:
         said |= {"cells_a": pair.cells[0], "cells_b": pair.cells[1]}

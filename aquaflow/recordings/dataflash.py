@@ -70,7 +70,7 @@ class Dataflash(TelemetryLog):
                 continue
             if data[at + 2] == DESCRIPTION:
                 kind, length, name, codes, labels = layout.fields.unpack_from(data, at + 3)
-                described = _described(name, codes, labels, length)
+                described = _describe(name, codes, labels, length)
                 if described is not None:
                     layouts[kind] = described
                 yield "FMT", {"Type": kind, "Length": length, "Name": name}
@@ -101,7 +101,7 @@ class Dataflash(TelemetryLog):
             self.notes.append(f"{bad} records of {self.path.name} hold no sane values")
 
 
-def _described(name: bytes, codes: bytes, labels: bytes, length: int) -> _Layout | None:
+def _describe(name: bytes, codes: bytes, labels: bytes, length: int) -> _Layout | None:
     """The layout that a FMT record gives; None if it contradicts itself."""
     try:
         layout = _layout(name, codes, labels)

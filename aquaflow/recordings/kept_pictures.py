@@ -63,7 +63,7 @@ class KeptPictures:
         if not self.is_due(frame.t_ns):
             return
         self._next_ns = frame.t_ns + round(1e9 * self._spacing_s)
-        data = encoded(frame)
+        data = encode(frame)
         try:
             make_subfolder(self._folder)
         except OSError as error:
@@ -123,7 +123,7 @@ def kept_pictures(dive: Path) -> dict[int, Path]:
     return {index: dive / FOLDER / _name(index) for index in sorted(_sizes(dive / FOLDER))}
 
 
-def encoded(frame: Frame) -> bytes:
+def encode(frame: Frame) -> bytes:
     """A JPEG file of the frame's picture, at most ``LONGEST_SIDE`` long."""
     import cv2
 

@@ -22,7 +22,7 @@ from pydantic import Field
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.errors.plain_yaml import read_mapping
 from aquaflow.config.device import MountingConfig
-from aquaflow.config.stage import StageConfig, validated
+from aquaflow.config.stage import StageConfig, validate
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.recordings.telemetry_log import ByteLog
 from aquaflow.sources import (
@@ -67,7 +67,7 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / MANIFEST
     data = read_mapping(path, "list of logs", "write `camera:` and `telemetry:` lines")
-    return validated(Manifest, data, str(path))
+    return validate(Manifest, data, str(path))
 
 
 class ManifestCamera:
@@ -85,7 +85,7 @@ class ManifestCamera:
         manifest = read_manifest(path)
         if manifest.camera is None:
             raise InputError(f"{path / MANIFEST} names no camera")
-        camera = open_recording(_named(path, manifest.camera), fps)
+        camera = open_recording(_named_file(path, manifest.camera), fps)
         return camera if manifest.mounting is None else MountedCamera(camera, manifest.mounting)
 
 
@@ -167,7 +167,7 @@ class ManifestTelemetry:
             log.close()
 
 
-def _named(folder: Path, name: str) -> Path:
+def _named_file(folder: Path, name: str) -> Path:
     """What the folder's manifest names.
 
     Raises:
@@ -180,7 +180,7 @@ def _named(folder: Path, name: str) -> Path:
 
 
 def _log(folder: Path, entry: LogEntry, starts_s: float) -> RecordedTelemetry:
-    path = _named(folder, entry.file)
+    path = _named_file(folder, entry.file)
     log = open_recorded_telemetry(path, entry.starts_s + starts_s)
     if entry.device is None:
         return log

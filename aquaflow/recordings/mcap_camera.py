@@ -174,14 +174,14 @@ class McapCamera:
             return None
         return counts.get(self.topic, 0) + counts.get(f"{self._base}/dropped", 0)
 
-    def _placed(self) -> Iterator[tuple[_Place, McapMessage | str]]:
+    def _placed_messages(self) -> Iterator[tuple[_Place, McapMessage | str]]:
         """Pictures with what belongs to them; a sentence instead of one that is missing."""
         extra: dict[str, Any] = {}
         mask: npt.NDArray[np.bool_] | None = None
         topics = {self.topic: "picture"}
         if self._ours:  # elsewhere, topics of these names hold what their makers mean by them
             topics |= {f"{self._base}/{kind}": kind for kind in ("dropped", "exposure", "mask")}
-        for count, message in _numbered(self._messages.of(topics.__contains__), self.topic):
+        for count, message in _number_messages(self._messages.of(topics.__contains__), self.topic):
             kind = topics[message.topic]
             if kind == "mask":
                 mask = compressed_picture(self._payloads.decode(message).data)[..., 0] > 0
@@ -200,7 +200,7 @@ class McapCamera:
                 yield place, message if gone is None else gone
 
     def _pictures(self, every: int, start: int) -> Iterator[Frame | Dropped]:
-        for place, found in self._placed():
+        for place, found in self._placed_messages():
             if not is_asked(place.index, every, start):
                 continue
             if isinstance(found, str):
@@ -225,7 +225,7 @@ class McapCamera:
         gone: list[Dropped] = []
 
         def units() -> Iterator[tuple[tuple[_Place, EncodedPicture], bytes]]:
-            for place, found in self._placed():
+            for place, found in self._placed_messages():
                 if isinstance(found, str):
                     gone.append(Dropped(place.index, place.t_ns, found))
                     continue
@@ -254,7 +254,9 @@ class McapCamera:
         return replace(frame, exposure_s=place.exposure_s, gain=place.gain, mask=place.mask)
 
 
-def _numbered(messages: Iterator[McapMessage], topic: str) -> Iterator[tuple[int, McapMessage]]:
+def _number_messages(
+    messages: Iterator[McapMessage], topic: str
+) -> Iterator[tuple[int, McapMessage]]:
     """Messages with the number of messages of ``topic`` before them."""
     count = 0
     for message in messages:

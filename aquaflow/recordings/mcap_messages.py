@@ -134,14 +134,14 @@ class McapMessages:
                 if not isinstance(record, Chunk):
                     yield record
                     continue
-                inside = _unpacked(record)
+                inside = _unpack(record)
                 damaged += inside is None
                 yield from inside or []
         if damaged:
             self.notes.append(f"{damaged} damaged chunks of {path.name} were left out")
 
 
-def _unpacked(chunk: Chunk) -> list[McapRecord] | None:
+def _unpack(chunk: Chunk) -> list[McapRecord] | None:
     """The records in a chunk; None if it is damaged, at the second attempt too."""
     from mcap.exceptions import EndOfFile, McapError
     from mcap.stream_reader import CRCValidationError, breakup_chunk

@@ -40,12 +40,12 @@ class NmeaText(ByteLog):
         if None in stamps:
             self.notes.append(f"{stamps.count(None)} lines of {self.path.name} have no time")
         clock = LogTime(self.starts_s)
-        for (_, match), stated_ns, stamp_ns in zip(matches, stamps, _filled(stamps), strict=True):
+        for (_, match), stated_ns, stamp_ns in zip(matches, stamps, _fill(stamps), strict=True):
             sentence = match[0] + b"\r\n"
             yield Read(self.path.stem, clock.at(stamp_ns), sentence, stated_ns)
 
 
-def _filled(stamps: list[int | None]) -> list[int]:
+def _fill(stamps: list[int | None]) -> list[int]:
     """Lines without a time have that of the line before; evenly spread if no line has one."""
     last = next((stamp for stamp in stamps if stamp is not None), None)
     if last is None:

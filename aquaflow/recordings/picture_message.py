@@ -51,7 +51,7 @@ def raw_picture(
             grey = rows[:, : 2 * width].copy().view("<u2").astype(np.int32)
             return to_rgb(grey, grey_16_white(grey))
         if name in BAYER or name in YUYV:
-            return _converted(rows, height, width, name)
+            return _convert(rows, height, width, name)
         channels = CHANNELS[name]
         picture = rows[:, : channels * width].reshape(height, width, channels)
     except KeyError:
@@ -64,7 +64,7 @@ def raw_picture(
     return np.ascontiguousarray(ordered)
 
 
-def _converted(
+def _convert(
     rows: npt.NDArray[np.uint8],  # [H, step]
     height: int,
     width: int,

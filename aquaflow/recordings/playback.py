@@ -93,7 +93,7 @@ def arrival_of(event: Event) -> int:
     return event.t_ns if isinstance(event, Dropped) else event.arrival_ns
 
 
-def arrived(event: Event, shift_ns: int, now_ns: int) -> Event:
+def delay_event(event: Event, shift_ns: int, now_ns: int) -> Event:
     """The same event ``shift_ns`` later, as it reaches this process at ``now_ns``."""
     if isinstance(event, Dropped):
         return replace(event, t_ns=event.t_ns + shift_ns)

@@ -37,7 +37,7 @@ def is_bag(path: Path) -> bool:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[AnyReader]:
+def open_bag(path: Path) -> Iterator[AnyReader]:
     """The bag, open.
 
     Raises:
@@ -89,7 +89,7 @@ def picture_connections(reader: AnyReader) -> list[Connection]:
     return [connection for connection in found if connection.topic == first]
 
 
-def decoded(reader: AnyReader, connection: Connection, data: bytes) -> Any | None:
+def decode(reader: AnyReader, connection: Connection, data: bytes) -> Any | None:
     """The message with its fields as attributes; None if it is damaged."""
     from rosbags.highlevel import AnyReaderError
 
@@ -112,5 +112,5 @@ def origin_of(reader: AnyReader) -> int:
     """Time of the first picture; that of the bag's first message where it holds no picture."""
     pictures = picture_connections(reader)
     for connection, received_ns, data in messages_in(reader, pictures, []):
-        return stamp_of(decoded(reader, connection, data), received_ns)
+        return stamp_of(decode(reader, connection, data), received_ns)
     return int(reader.start_time)

@@ -16,10 +16,10 @@ from aquaflow.recordings.picture_message import compressed_picture, raw_picture
 from aquaflow.recordings.rosbag import (
     COMPRESSED,
     PICTURES,
-    decoded,
+    decode,
     is_bag,
     messages_in,
-    opened,
+    open_bag,
     origin_of,
     picture_connections,
     stamp_of,
@@ -55,7 +55,7 @@ class RosbagCamera:
         """
         self.path = path
         self.notes: list[str] = []
-        with opened(path) as reader:
+        with open_bag(path) as reader:
             pictures = picture_connections(reader)
             if not pictures:
                 raise InputError(f"the bag {path} holds no picture; give a bag with a camera")
@@ -85,13 +85,13 @@ class RosbagCamera:
         self.notes = []
         if self._other_topics:
             self.notes.append(f"{self.topic} is used; also there: {', '.join(self._other_topics)}")
-        with opened(self.path) as reader:
+        with open_bag(self.path) as reader:
             messages = messages_in(reader, picture_connections(reader), self.notes)
             for index, (connection, received_ns, data) in enumerate(messages):
                 if stop is not None and index >= stop:
                     return
                 if is_asked(index, every, start):
-                    message = decoded(reader, connection, data)
+                    message = decode(reader, connection, data)
                     yield self._frame(index, message, received_ns, connection.msgtype)
 
     def close(self) -> None:
@@ -124,7 +124,7 @@ def _calibration(reader: AnyReader, topic: str) -> CameraModel | None:
     infos = [connection for connection in reader.connections if connection.msgtype == CAMERA_INFO]
     siblings = [connection for connection in infos if connection.topic.startswith(base)]
     for connection, _, data in messages_in(reader, siblings, []):
-        info = decoded(reader, connection, data)
+        info = decode(reader, connection, data)
         if info is None:
             return None
         fields = {name.lower(): value for name, value in vars(info).items()}

@@ -12,8 +12,8 @@ from typing import Any, TypeAlias
 
 from aquaflow.drivers.fixes import sigma_of
 from aquaflow.drivers.plausible import plausible
-from aquaflow.drivers.rotation import Vector, normalised, product
-from aquaflow.recordings.rosbag import decoded, is_bag, messages_in, opened, origin_of, stamp_of
+from aquaflow.drivers.rotation import Vector, normalise, product
+from aquaflow.recordings.rosbag import decode, is_bag, messages_in, open_bag, origin_of, stamp_of
 from aquaflow.recordings.telemetry_log import LoggedUtc
 from aquaflow.types import (
     Acceleration,
@@ -71,12 +71,12 @@ class RosbagTelemetry:
         """
         bad = 0
         self.notes = []
-        with opened(self.path) as reader:
+        with open_bag(self.path) as reader:
             base_ns = origin_of(reader) - self._shift_ns
             utc = LoggedUtc(f"{self.path.stem}/bag", iter([(0, base_ns)]))
             wanted = [c for c in reader.connections if c.msgtype in CONVERSIONS]
             for connection, received_ns, data in messages_in(reader, wanted, self.notes):
-                message = decoded(reader, connection, data)
+                message = decode(reader, connection, data)
                 arrival_ns = received_ns - base_ns
                 yield from utc.at(arrival_ns, received_ns)
                 t_ns = min(stamp_of(message, received_ns) - base_ns, arrival_ns)
@@ -98,7 +98,7 @@ def _imu(message: Any, t_ns: int, arrival_ns: int, source: str) -> list[Telemetr
     found: list[TelemetrySample] = []
     if message.orientation_covariance[0] != NOT_MEASURED:
         q = message.orientation
-        enu_flu = normalised(_finite4(q.w, q.x, q.y, q.z))
+        enu_flu = normalise(_finite4(q.w, q.x, q.y, q.z))
         wxyz = product(product(NED_FROM_ENU, enu_flu), FLU_FROM_FRD)
         found.append(Attitude(t_ns, arrival_ns, source, wxyz))
     if message.angular_velocity_covariance[0] != NOT_MEASURED:

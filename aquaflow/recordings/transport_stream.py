@@ -15,7 +15,7 @@ DATAGRAM = 7 * 188
 """Bytes: as many packets of MPEG-TS as fit into one Ethernet frame."""
 
 
-def encoded(
+def encode(
     images: list[npt.NDArray[np.uint8]],  # [H, W, 3] RGB
     fps: float,
 ) -> bytes:
@@ -46,7 +46,7 @@ class UdpCamera:
         self.plugged_in = threading.Event()
         self.plugged_in.set()
         self._ending = threading.Event()
-        stream = encoded(images, fps)
+        stream = encode(images, fps)
         self._datagrams = [stream[i : i + DATAGRAM] for i in range(0, len(stream), DATAGRAM)]
         self._period_s = len(images) / fps / len(self._datagrams)
         self._thread = threading.Thread(target=self._run, daemon=True)

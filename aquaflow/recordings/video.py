@@ -44,7 +44,7 @@ class VideoFile:
         """
         self.path = path
         self.notes: list[str] = []
-        with _opened(path) as capture:
+        with _open_capture(path) as capture:
             import cv2
 
             if not capture.isOpened() or not capture.grab():
@@ -82,7 +82,7 @@ class VideoFile:
         from those of a full pass.
         """
         self.notes = [note for note in self.notes if note == self._calibration_note]
-        with _opened(self.path) as capture:
+        with _open_capture(self.path) as capture:
             clock = _Clock(self._period_ns)
             index = 0
             while stop is None or index < stop:
@@ -155,7 +155,7 @@ class _Clock:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_capture(path: Path) -> Iterator[Any]:
     """A capture on ``path`` that says nothing on stderr: what goes wrong is in the notes."""
     import cv2
 

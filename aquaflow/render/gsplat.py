@@ -113,12 +113,12 @@ class GsplatRenderer:
             image = gaussians[4].new_zeros(height, width, colours.shape[1])
             return Rendering(image, image[..., 0].clone(), visible, radius_px)
         chosen = [tensor[kept] for tensor in gaussians]
-        image, alpha, extent = _rasterised(chosen, view, intrinsics, width, height, active)
+        image, alpha, extent = _rasterise(chosen, view, intrinsics, width, height, active)
         radius_px[kept] = extent.amax(1)
         return Rendering(image, alpha, radius_px > 0, radius_px)
 
 
-def _rasterised(
+def _rasterise(
     gaussians: list[Tensor],  # means [M, 3], quats [M, 4], scales [M, 3], opacities [M], colours
     view: Tensor,  # [4, 4] world -> camera
     intrinsics: Tensor,  # [3, 3] px

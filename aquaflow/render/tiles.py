@@ -128,7 +128,7 @@ def _draw(
     layers = torch.cat([colours, opaque], 1)[footprints.index]
     drawn: list[Tensor] = []
     for first, last, longest in _batches(lists):
-        slots, filled = _padded(lists, first, last, longest, layers.device)
+        slots, filled = _pad(lists, first, last, longest, layers.device)
         corner = _tile_corners(lists.tile[first:last], tiles_x, layers)
         arguments = (footprints.centre, footprints.conic, footprints.opacity, layers)
         drawn.append(
@@ -141,7 +141,7 @@ def _draw(
     return image[:height, :width]
 
 
-def _padded(
+def _pad(
     lists: _TileLists, first: int, last: int, longest: int, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """[T, longest] footprint per slot, and whether the slot is filled."""

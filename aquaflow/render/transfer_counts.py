@@ -18,7 +18,7 @@ class TransferCounts:
         with self._lock:
             self._counts[name] += tensors
 
-    def taken(self) -> dict[str, int]:
+    def take(self) -> dict[str, int]:
         """The counts so far, by name."""
         with self._lock:
             return dict(self._counts)
@@ -30,4 +30,4 @@ COUNTS = TransferCounts()
 
 def transfers() -> dict[str, int]:
     """Tensors moved so far in this process, by the name of the function that moved them."""
-    return COUNTS.taken()
+    return COUNTS.take()

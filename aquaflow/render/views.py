@@ -247,7 +247,7 @@ class ViewStore:
         known = [view for view in views if self._pixels.restore(view.frame_index)]
         for view in known:
             view.use_store(self._pixels)
-        removed = self._pixels.removed()
+        removed = self._pixels.removed_numbers()
         there = {view.frame_index for view in known}
         self.lost |= {view.frame_index for view in views} - there - removed
         return known

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from aquaflow.base.clocks.deadline import Deadline, Now
 
 SETTLED, REFINED, EVALUATED = 0.25, 0.55, 0.80
-"""Shares of the whole after which a phase ends (docs/measurements.md#finishing)."""
+"""Shares of the whole after which a phase ends (notes/measurements.md#finishing)."""
 
 
 class FinishTime:

@@ -85,21 +85,21 @@ class MapInputs:
 
     def retire_last(self) -> None:
         """After the last frame: insert the keyframe in use, with its depths as they are now."""
-        for insertion in self._retired():
+        for insertion in self._retire():
             self._maps.insert(insertion)
 
     def _growth(self, tracked: Tracked, view: View) -> Growth:
         """What the frame brings to the map; a new keyframe also retires the one before it."""
         retired: list[Insertion] = []
         if tracked.frame_class is FrameClass.KEYFRAME:
-            retired = self._retired()
+            retired = self._retire()
             self._views = {view.keyframe: view}
         steps = self._steps(tracked.frame_class)
         frame = self._frame_of(tracked.sub_map)
         unit = frame.T_nm.scale if frame.metric else None
         return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired), unit)
 
-    def _retired(self) -> list[Insertion]:
+    def _retire(self) -> list[Insertion]:
         """The keyframe in use, with its pointmap as fused until now; from here on it is not."""
         retired, self._views = self._views, {}
         keyframes = self._keyframes

@@ -130,7 +130,7 @@ class Slam:
         frame = self._without_overlay(frame)
         verdict = self._gate(frame)
         if not verdict.passed:
-            return [self._publish(self._skipped(frame, verdict))]
+            return [self._publish(self._skip(frame, verdict))]
         step = self._track(frame)  # Eqs. 1 and 3
         return self._take(step)  # edges to the graph, frames to the maps, jobs to the worker
 
@@ -150,7 +150,7 @@ class Slam:
         """Apply what the worker has found since; with ``wait``, all that was asked for."""
         if self.worker.waiting():
             with self.profiler.stage("graph"):
-                for each in self.worker.finished(wait):
+                for each in self.worker.take_finished(wait):
                     with self.failures.contain(each.stage, each.frame):
                         self._apply(each.found)
 
@@ -159,7 +159,7 @@ class Slam:
         if isinstance(found, LoopsFound):
             self.graph.close_loops(found)
         elif isinstance(found, ReuseResult):
-            revisit = self.tracker.looked(found)
+            revisit = self.tracker.return_to(found)
             if revisit is not None:
                 self._revisit(revisit)
         elif isinstance(found, BaseLookup) and self.in_base is not None:
@@ -268,7 +268,7 @@ class Slam:
             return frame
         masked = frame
         with self.stages("overlay", frame.index):
-            masked = self.overlays.masked(frame)
+            masked = self.overlays.mask(frame)
         return masked
 
     def _gate(self, frame: Frame) -> GateVerdict:
@@ -345,7 +345,7 @@ class Slam:
 
     # --- poses --------------------------------------------------------------------------------
 
-    def _skipped(self, frame: Frame, verdict: GateVerdict) -> RelativeFrame:
+    def _skip(self, frame: Frame, verdict: GateVerdict) -> RelativeFrame:
         """A frame that the gate refused; a duplicate has the pose of the frame before it."""
         if not verdict.same_place or self._latest is None:
             sub_map = self.tracker.sub_map

@@ -58,11 +58,11 @@ def discover(
 ) -> DiscoveryResult:
     """Ask every installed driver, all at once; one that fails, or does not end within
     ``patience_s``, is reported in ``problems``. Without ``hosts`` the network is left alone."""
-    looks = [_DiscoveryThread(entry, entry.load) for entry in _registered(DISCOVERY)]
+    looks = [_DiscoveryThread(entry, entry.load) for entry in _registered_drivers(DISCOVERY)]
     if hosts:
         looks += [
-            _DiscoveryThread(entry, partial(_given, entry, hosts))
-            for entry in _registered(NETWORK_DISCOVERY)
+            _DiscoveryThread(entry, partial(_pass_hosts, entry, hosts))
+            for entry in _registered_drivers(NETWORK_DISCOVERY)
         ]
     until_s = time.monotonic() + patience_s
     for look in looks:
@@ -73,11 +73,11 @@ def discover(
     )
 
 
-def _registered(group: str) -> list[EntryPoint]:
+def _registered_drivers(group: str) -> list[EntryPoint]:
     return sorted(entry_points(group=group), key=lambda each: each.name)
 
 
-def _given(entry: EntryPoint, hosts: Sequence[str]) -> Discover:
+def _pass_hosts(entry: EntryPoint, hosts: Sequence[str]) -> Discover:
     look: NetworkDiscover = entry.load()
     return partial(look, hosts)
 

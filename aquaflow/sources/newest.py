@@ -51,7 +51,7 @@ class Newest(Generic[Item]):
             self._asked = not self._items  # after a timeout the consumer comes again
             return self._items.popleft() if self._items else None
 
-    def asked(self, timeout_s: float) -> bool:
+    def wait_for_consumer(self, timeout_s: float) -> bool:
         """Wait until a consumer waits, so that items can be produced on demand."""
         with self._changed:
             return self._changed.wait_for(lambda: self._asked or self._ended, timeout_s)

@@ -14,7 +14,7 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.geometry.earth import north_east
 from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.directions import oriented
+from aquaflow.telemetry.directions import orient
 from aquaflow.telemetry.factors.altitude import AltitudeFactor
 from aquaflow.telemetry.factors.depth import DepthFactor
 from aquaflow.telemetry.factors.factor import Factor
@@ -49,10 +49,10 @@ def problem_of(
     usable = UsableSeries.of(telemetry, path, rejected)
     compasses = [each for each in usable.attitude if (each.source, "heading") not in rejected]
     declination = declination_of(telemetry, config)
-    problem = oriented(usable, compasses, path, config, mounting, carried, declination)
+    problem = orient(usable, compasses, path, config, mounting, carried, declination)
     extra = [factor for factor in extra if (factor.source, factor.kind) not in rejected]
     problem.reports += usable.left_out
-    _scaled(problem, usable, path, extra)
+    _scale(problem, usable, path, extra)
     if problem.level:
         for depth in usable.depth:
             problem.factors.append(DepthFactor(depth, path))
@@ -76,7 +76,7 @@ def problem_of(
     return problem
 
 
-def _scaled(
+def _scale(
     problem: TelemetryProblem, usable: UsableSeries, path: CameraPath, extra: Sequence[Factor]
 ) -> None:
     """A rough scale, from the source that gives the best one."""

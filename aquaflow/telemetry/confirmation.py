@@ -56,7 +56,7 @@ class Confirmation:
         """True if too little of the path shows the scale to see whether its parts agree."""
         return self.parts < (LEAST_PARTS_ALONE if self.kinds == 1 else LEAST_PARTS)
 
-    def applied(self, solution: Solution) -> Solution:
+    def apply(self, solution: Solution) -> Solution:
         """The solution with a scale that is no surer than this."""
         covariance = solution.covariance.copy()
         least = min(self.sigma, UNKNOWN_SIGMA) ** 2

@@ -55,7 +55,7 @@ def carried_from(
     if solution is None or not (frame.metric and frame.level) or len(next_path) == 0:
         return None
     first_s, last_s = float(path.t_s[-1]), float(next_path.t_s[0])
-    reckoned = _reckoned(telemetry, solution.state.heading, first_s, last_s)
+    reckoned = _reckon(telemetry, solution.state.heading, first_s, last_s)
     state = solution.state
     heading_sigma = float(
         np.hypot(np.sqrt(solution.covariance[HEADING, HEADING][0, 0]), HEADING_WANDER)
@@ -68,9 +68,7 @@ def carried_from(
     return Carried(state, heading_sigma, place, frame.origin, frame.north == "true north")
 
 
-def _reckoned(
-    telemetry: Telemetry, heading: float, first_s: float, last_s: float
-) -> Reckoned | None:
+def _reckon(telemetry: Telemetry, heading: float, first_s: float, last_s: float) -> Reckoned | None:
     """Displacement between two moments; None where DVL or attitude do not cover the time."""
     span = last_s - first_s
     velocities, attitudes = telemetry.of(Velocity), telemetry.of(Attitude)

@@ -89,7 +89,7 @@ class DeviceClockEstimate:
         """The newest offset; 0 where none is known."""
         return float(self.offset_s[-1]) if self.known else 0.0
 
-    def corrected(self, series: Series) -> Series:
+    def correct(self, series: Series) -> Series:
         """Samples on the pictures' clock, without those whose time is not known."""
         if not self.known or self.right or len(series) == 0:
             return series
@@ -157,11 +157,11 @@ class DeviceClocks:
         if any(factor.kind in SHOWN_BY_THE_PATH for factor in problem.factors):
             return False
         return any(
-            factor.kind in MEASURED_IN_TIME and not self._shown(factor.source)
+            factor.kind in MEASURED_IN_TIME and not self._is_shown(factor.source)
             for factor in problem.factors
         )
 
-    def _shown(self, source: str) -> bool:
+    def _is_shown(self, source: str) -> bool:
         clock = self.own.get(device_of(source))
         return clock is not None and clock.known
 
@@ -171,7 +171,7 @@ class DeviceClocks:
         clock = self.reference
         return "some devices have no gyro or attitude" if clock.known else clock.reason
 
-    def stated(self, frame: WorldFrame) -> WorldFrame:
+    def with_clocks(self, frame: WorldFrame) -> WorldFrame:
         """The frame with what was found of the clocks."""
         clock = self.reference
         said = "; ".join(filter(None, (frame.scale_source, clock.in_words())))
@@ -189,11 +189,11 @@ class DeviceClocks:
                 )
         return found
 
-    def corrected(self, telemetry: Telemetry) -> Telemetry:
+    def correct(self, telemetry: Telemetry) -> Telemetry:
         """All samples on the pictures' clock; the same object where nothing is to be done."""
         if all(not clock.known or clock.right for clock in self.own.values()):
             return telemetry
-        return telemetry.retimed(lambda series: self.clock_of(series.source).corrected(series))
+        return telemetry.retime(lambda series: self.clock_of(series.source).correct(series))
 
 
 def _pieces(path: CameraPath) -> list[Turns]:

@@ -35,7 +35,7 @@ SCALE_SIGMA = 3.0
 """Log: a start's median depth may be 5 cm or 20 m."""
 
 
-def oriented(
+def orient(
     usable: UsableSeries,
     compasses: Sequence[Series],
     path: CameraPath,

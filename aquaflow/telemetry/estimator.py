@@ -69,7 +69,7 @@ def estimate(
         return Estimate(WorldFrame.unknown())
     R_cb = None if mounting is None else camera_in_body(mounting).R.T
     clocks = DeviceClocks.of(telemetry, path, R_cb)
-    telemetry = clocks.corrected(telemetry)
+    telemetry = clocks.correct(telemetry)
     rejected = clocks.unlike(telemetry)
 
     def problem_along(path: CameraPath, points: Callable[[], Array]) -> TelemetryProblem:
@@ -94,10 +94,10 @@ def estimate(
         if confirmation.vague:
             unconfirmed = f"not confirmed: {confirmation.in_words()}, and {clocks.why_open}"
         elif confirmation.refuted or not clocks.known:
-            solution = confirmation.applied(solution)
+            solution = confirmation.apply(solution)
             problem.doubt = f"{confirmation.in_words()}, and {clocks.why_open}"
     frame = frame_of(problem, solution, path)
     if unconfirmed and frame.metric:
         said = f"{frame.scale_source}; {unconfirmed}"
         frame = replace(frame, scale_confirmed=False, scale_source=said)
-    return Estimate(clocks.stated(frame), problem, solution)
+    return Estimate(clocks.with_clocks(frame), problem, solution)

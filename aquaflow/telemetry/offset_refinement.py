@@ -108,7 +108,7 @@ class Refinement:
 
     def fit(self, peak: OffsetPeak) -> OffsetFit | None:
         """The optimum near ``peak``; None where too little is measured there."""
-        used = self._used(peak.offset_s)
+        used = self._used_points(peak.offset_s)
         if 3 * used.sum() <= 2 * PARAMETERS:
             return None
         smooth = csr_array(self._smooth[np.flatnonzero(used)])
@@ -136,7 +136,7 @@ class Refinement:
         whole[used] = residual
         return OffsetFit(x, covariance, model.R_cb(x), middle_s, used, whole, self._seen)
 
-    def _used(self, offset_s: float) -> Mask:
+    def _used_points(self, offset_s: float) -> Mask:
         """[G] grid points whose surroundings were measured by both."""
         start_s, end_s = self._camera.start_s - offset_s, self._camera.end_s - offset_s
         _, covered = self._body.within(start_s, end_s)

@@ -48,7 +48,7 @@ class RecentMotion:
                 return on_so3(R)
         return None
 
-    def moved(self, first_s: float, last_s: float) -> Array | None:
+    def displacement(self, first_s: float, last_s: float) -> Array | None:
         """[3] m, displacement of the body's origin in its axes on the way; None without a DVL.
 
         The turn within the time is left out: it is a few degrees between two frames.

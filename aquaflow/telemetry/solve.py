@@ -78,7 +78,7 @@ def solve(
     correlated: list[_Correlated] = []
     for _ in range(ROUNDS):
         residuals = [factor.residuals(found.state) for factor in factors]
-        kept = tuple(_gated(f, r) for f, r in zip(factors, residuals, strict=True))
+        kept = tuple(_gate(f, r) for f, r in zip(factors, residuals, strict=True))
         noise = tuple(
             likeliest(f.t_s[k], r[k], f.sigma[k], f.slow)
             for f, r, k in zip(factors, residuals, kept, strict=True)
@@ -194,7 +194,7 @@ class _Posterior:
     def move(self, at: _Estimate, step: Array) -> _Estimate:
         """A step [P], shortened as a whole where it turns too far."""
         step = step * min(1.0, LONGEST_TURN / max(float(np.abs(step[:4]).max()), LONGEST_TURN))
-        return _Estimate(at.state.moved(step), at.departure + step)
+        return _Estimate(at.state.move(step), at.departure + step)
 
     def _residuals(self, at: _Estimate) -> list[Array]:
         factors = self._derivatives.factors
@@ -216,7 +216,7 @@ def _descend(
     return found.state
 
 
-def _gated(
+def _gate(
     factor: Factor,
     r: Array,  # [N, D]
 ) -> Mask:

@@ -48,7 +48,7 @@ class MetricState:
         """Metres per map unit."""
         return float(np.exp(self.log_scale))
 
-    def moved(
+    def move(
         self,
         step: Array,  # [P]
     ) -> MetricState:
@@ -56,10 +56,10 @@ class MetricState:
         return replace(
             self,
             log_scale=self.log_scale + float(step[SCALE][0]),
-            R_nm=_turned(self.R_nm, step[TURN]),
+            R_nm=_turn(self.R_nm, step[TURN]),
             t_n=self.t_n + step[SHIFT],
-            R_bc=_turned(self.R_bc, step[CAMERA]),
-            R_bd=_turned(self.R_bd, step[DVL]),
+            R_bc=_turn(self.R_bc, step[CAMERA]),
+            R_bd=_turn(self.R_bd, step[DVL]),
             log_dvl=self.log_dvl + float(step[DVL_SCALE][0]),
             heading=self.heading + float(step[HEADING][0]),
             lag_s=self.lag_s + float(step[LAG][0]),
@@ -75,7 +75,7 @@ class MetricState:
         return R_nb, self.scale * p_m @ self.R_nm.T + self.t_n - R_nb @ self.c_b
 
 
-def _turned(
+def _turn(
     R: Array,  # [3, 3]
     by: Array,  # [3] rad
 ) -> Array:

@@ -33,7 +33,7 @@ class Series:
         chosen = (self.t_s >= first_s) & (self.t_s <= last_s)
         return Series(self.source, self.t_s[chosen], self.values[chosen])
 
-    def thinned(self, most: int) -> Series:
+    def thin(self, most: int) -> Series:
         """At most so many samples, evenly chosen."""
         step = max(1, -(-len(self) // most))
         return Series(self.source, self.t_s[::step], self.values[::step])
@@ -113,7 +113,7 @@ class Telemetry:
         other.utc = list(self.utc)
         return other
 
-    def retimed(self, change: Callable[[Series], Series]) -> Telemetry:
+    def retime(self, change: Callable[[Series], Series]) -> Telemetry:
         """The same with every series as ``change`` gives it."""
         other = self.copy()
         other._series = {key: change(self._of(key)) for key in self._tables}

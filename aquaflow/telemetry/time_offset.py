@@ -96,7 +96,9 @@ class TimeOffset:
         return float(np.hypot(self.sigma_s, self.drift_sigma * (t_s - self.middle_s)))
 
 
-def synchronised(samples: Iterable[TelemetrySample], offset: TimeOffset) -> list[TelemetrySample]:
+def synchronise_samples(
+    samples: Iterable[TelemetrySample], offset: TimeOffset
+) -> list[TelemetrySample]:
     """The samples of a log on the video's clock: moment of measurement and of arrival."""
     return [
         replace(
@@ -148,7 +150,7 @@ def estimate_time_offset(
         raise UnlikeError("the log's rotations resemble the video's at no offset")
     best = max(fits, key=lambda fit: fit.gain)
     rivals = [fit for fit in fits if abs(fit.x[OFFSET] - best.x[OFFSET]) > sigma_s]
-    return _judged(best, rivals, sigma_s)
+    return _judge(best, rivals, sigma_s)
 
 
 def _as_expected(
@@ -168,12 +170,12 @@ def _as_expected(
         if rival.gain > fit.gain and _chance(fit.residual, rival, both, step_s) < CHANCE_OF_RIVAL:
             return None
     try:
-        return _judged(fit, [], step_s, CHANCE_AS_EXPECTED)
+        return _judge(fit, [], step_s, CHANCE_AS_EXPECTED)
     except NotSynchronisedError:
         return None
 
 
-def _judged(
+def _judge(
     best: OffsetFit, rivals: list[OffsetFit], step_s: float, chance: float = CHANCE_OF_NOTHING
 ) -> TimeOffset:
     """The best fit as a result.
@@ -181,7 +183,7 @@ def _judged(
     Raises:
         NotSynchronisedError: it is not significant, not the only one, or not sharp.
     """
-    if _chance(_unexplained(best), best, best.used, step_s) > chance:
+    if _chance(_unexplained_rates(best), best, best.used, step_s) > chance:
         raise UnlikeError(
             f"the log's rotations do not explain the video's (correlation {best.correlation:.2f} "
             f"at the best offset, {best.x[OFFSET]:+.1f} s)"
@@ -228,7 +230,7 @@ def _rms(cells: RateSeries) -> float:
     )
 
 
-def _unexplained(fit: OffsetFit) -> Array:
+def _unexplained_rates(fit: OffsetFit) -> Array:
     """[G, 3] what is left of the camera's rates if the telemetry explains nothing."""
     return np.asarray(fit.seen - fit.seen[fit.used].mean(axis=0))
 

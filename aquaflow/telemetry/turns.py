@@ -61,7 +61,7 @@ class Turns:
         return Turns(t_s[:-1], t_s[1:], angle)._usable()
 
     @staticmethod
-    def joined(parts: Sequence[Turns]) -> Turns:
+    def join(parts: Sequence[Turns]) -> Turns:
         """The turns of several sub-maps, of which none overlaps another, as one."""
         parts = sorted((part for part in parts if len(part.start_s)), key=lambda p: p.start_s[0])
         if not parts:

@@ -18,7 +18,7 @@ from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.keyframes import Keyframe
 from aquaflow.tracking.lens_adjustment import adjust_lens, clusters_of, model_error
 from aquaflow.tracking.lens_equations import Array, LensObservations
-from aquaflow.tracking.lens_matches import LensView, matched
+from aquaflow.tracking.lens_matches import LensView, match_pixels
 
 MAX_VIEWS = 8
 """Keyframes used: with the pairs below, ten pairs."""
@@ -88,13 +88,13 @@ def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
     chosen = most_turning([each for each in keyframes if each.T_wc.is_finite()])
     if len(chosen) < MIN_VIEWS:
         return None
-    observations = matched([view_of(keyframe) for keyframe in chosen], pairs_of(len(chosen)))
+    observations = match_pixels([view_of(keyframe) for keyframe in chosen], pairs_of(len(chosen)))
     if observations is None:
         return None
     R_wc = np.stack([keyframe.T_wc.R for keyframe in chosen])
     centres = np.stack([keyframe.T_wc.t for keyframe in chosen])
     try:
-        return estimated(observations, R_wc, centres)
+        return estimate(observations, R_wc, centres)
     except np.linalg.LinAlgError:
         return None
 
@@ -114,7 +114,7 @@ def pairs_of(views: int) -> list[tuple[int, int]]:
     return [(i, i + 1) for i in range(views - 1)] + [(i, i + 2) for i in range(0, views - 2, 2)]
 
 
-def estimated(
+def estimate(
     observations: LensObservations,
     R_wc: Array,  # [V, 3, 3]
     centres: Array,  # [V, 3] world

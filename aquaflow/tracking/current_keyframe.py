@@ -84,7 +84,7 @@ class CurrentKeyframe:
         self.motion = T_fk @ self.T_fk.inverse()
         self.T_fk, self.matches = T_fk, matches
 
-    def tracked(
+    def tracked_result(
         self,
         frame: Frame,
         frame_class: FrameClass,
@@ -173,12 +173,12 @@ class KeyframeTracker:
         """Update the motion prediction and the keyframe's depths from the frame."""
         T_fk, pointmap = solved.estimate.T, at.keyframe.pointmap
         at.moved_to(T_fk, solved.pair.matches)
-        if self.hidden(solved):  # flakes have matches, too; the scene is where the pose puts it
-            known = pointmap.known(self._config.known_sigma)
+        if self.is_hidden(solved):  # flakes have matches, too; the scene is where the pose puts it
+            known = pointmap.is_known(self._config.known_sigma)
             at.matches = predicted_matches(pointmap, known, T_fk, camera, solved.pair.matches)
         fuse(pointmap, solved.pair, T_fk, camera, self._config.sigma_px)
 
-    def hidden(self, solved: Matched) -> bool:
+    def is_hidden(self, solved: Matched) -> bool:
         """True if something in front of the scene hides the matches."""
         return solved.visibility.seen < MIN_SEEN
 
@@ -186,7 +186,7 @@ class KeyframeTracker:
         """The paper's rules, keyframe by matched share and mapping frame by parallax; but what is
         hidden is neither, unless the keyframe goes out of view."""
         config = self._config
-        hidden = self.hidden(solved)
+        hidden = self.is_hidden(solved)
         leaving = solved.visibility.overlap < KEYFRAME_OVERLAP
         leaving |= solved.support < SCARCE * config.min_support
         if solved.share < config.keyframe_share and (leaving or not hidden):
@@ -201,12 +201,14 @@ class KeyframeTracker:
     ) -> tuple[Pointmap, LearnedDepth | None]:
         """The keyframe's depths in the frame's own pixels, and the prior's where it knows them."""
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
-        reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
+        reliable = (
+            self.shown_pixels(at, solved, camera) if self.is_hidden(solved) else pair.valid_back
+        )
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
         config, known, unit = self._config, self._config.known_sigma, pair.range_unit
 
         def before() -> Pointmap:
-            return transfer(pointmap.completed(known), pair.matches_back, reliable, T_fk, camera)
+            return transfer(pointmap.complete(known), pair.matches_back, reliable, T_fk, camera)
 
         return own, add_learned(own, pair.X_b, pair.Q_b, known, config.learned, unit, before)
 
@@ -228,7 +230,7 @@ class KeyframeTracker:
         moves = moving(pointmap, depth, seen)
         return only_where(frame, ~moves), pointmap.not_learned(moves)
 
-    def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
+    def shown_pixels(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
         """[H, W] pixels of the frame that show what the keyframe shows."""
         pair, pointmap = solved.pair, at.keyframe.pointmap
         return agreeing(pointmap, pair.matches_back, pair.valid_back, solved.estimate.T, camera)
@@ -237,7 +239,7 @@ class KeyframeTracker:
         self, frame: Frame, at: CurrentKeyframe, solved: Matched, camera: CameraModel
     ) -> Frame:
         """The frame with its mask limited to pixels that the keyframe shows too."""
-        return only_where(frame, self.shown(at, solved, camera))
+        return only_where(frame, self.shown_pixels(at, solved, camera))
 
     def at_new_keyframe(
         self,
@@ -305,7 +307,7 @@ class KeyframeTracker:
             solved = self.place(back, encoding, camera, pair)
         except InputError:
             return None  # a keyframe that cannot be read back is skipped
-        if solved is None or self.hidden(solved):
+        if solved is None or self.is_hidden(solved):
             return None
         shift = camera.project(solved.estimate.T.apply(solved.points))
         shift = np.linalg.norm(shift - camera.project(T_fk.apply(solved.points)), axis=1)

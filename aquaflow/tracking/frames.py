@@ -79,7 +79,7 @@ class Tracked:
     reason: str = ""
 
     @staticmethod
-    def lost(frame: Frame, sub_map: int, reason: str = "no pose found") -> Tracked:
+    def as_lost(frame: Frame, sub_map: int, reason: str = "no pose found") -> Tracked:
         """A frame that got no pose."""
         return Tracked(frame, FrameClass.LOST, sub_map, reason=reason)
 

@@ -22,7 +22,7 @@ from aquaflow.tracking.lens_equations import (
     SelfCalibration,
     Weighting,
     residuals,
-    triangulated,
+    triangulate,
 )
 
 ROUNDS = 4
@@ -69,7 +69,7 @@ def adjust_lens(
     sigmas: list[float] = []
     weighting = Weighting(1.0, np.zeros(0, dtype=bool))
     for number in range(ROUNDS):
-        state = replace(state, rho=triangulated(observations, state))
+        state = replace(state, rho=triangulate(observations, state))
         size = np.linalg.norm(residuals(observations, state), axis=-1)
         ahead = state.rho[observations.point] > 0.0
         sigma = _sigma(size[ahead])
@@ -91,7 +91,9 @@ def _covariance(
     equations = LensEquations(observations, state, weighting, terms)
     H = equations.hessian
     free = slice(0, len(H) - TERMS + terms)
-    inverse: Array = np.asarray(np.linalg.inv(equations.held(H)[free, free]), dtype=np.float64)
+    inverse: Array = np.asarray(
+        np.linalg.inv(equations.hold_gauge(H)[free, free]), dtype=np.float64
+    )
     scatter = np.zeros_like(inverse)
     for cluster in np.unique(clusters):
         gradient = equations.gradient_of(clusters == cluster)

@@ -106,7 +106,7 @@ class LensEquations:
         self._H_pp = 1e-9 + np.bincount(point, weights * np.sum(along**2, axis=1), count)
         self._g_p = np.bincount(point, weights * np.sum(along * error, axis=1), count)
         by_point = np.einsum("mr,mrk->mk", along, self._wJ)
-        self._H_pc = _summed(point[:, None] * width + self._columns, by_point, count * width)
+        self._H_pc = _add_up(point[:, None] * width + self._columns, by_point, count * width)
         self._H_pc = self._H_pc.reshape(count, width)
         self._by_match = np.einsum("mrk,mr->mk", self._wJ, error)
 
@@ -130,11 +130,11 @@ class LensEquations:
     ) -> Array:
         """[C] of the ``points``, their depths eliminated."""
         rows, width = points[self._observations.point], self._H_pc.shape[1]
-        direct = _summed(self._columns[rows], self._by_match[rows], width)
+        direct = _add_up(self._columns[rows], self._by_match[rows], width)
         gain = self._g_p[points] / self._H_pp[points]
         return np.asarray(direct - gain @ self._H_pc[points])
 
-    def held(
+    def hold_gauge(
         self,
         H: Array,  # [C, C]
     ) -> Array:
@@ -159,11 +159,11 @@ class LensEquations:
     def solve(self, damping: float) -> Array | None:
         """[C] damped step of poses and lens, in which only the free terms of the lens move."""
         free = slice(0, len(self.gradient) - TERMS + self._terms)
-        H = self.held(self.hessian)[free, free]
+        H = self.hold_gauge(self.hessian)[free, free]
         found = NormalEquations(H, self.gradient[free], self.cost).solve(damping)
         return None if found is None else np.append(found, np.zeros(TERMS - self._terms))
 
-    def moved(
+    def move(
         self,
         step: Array,  # [C]
     ) -> LensUnknowns:
@@ -193,7 +193,7 @@ class SelfCalibration:
     def move(self, state: LensUnknowns, step: Array) -> LensUnknowns:
         """Poses, depths and lens after a step [C] from where they were linearised last."""
         assert self._equations is not None
-        return self._equations.moved(step)
+        return self._equations.move(step)
 
 
 def _columns(observations: LensObservations, views: int) -> Indices:
@@ -204,7 +204,7 @@ def _columns(observations: LensObservations, views: int) -> Indices:
     return np.concatenate([*blocks, lens], axis=1)
 
 
-def _summed(
+def _add_up(
     where: Indices,  # [...] below size
     values: Array,  # [...]
     size: int,
@@ -213,7 +213,7 @@ def _summed(
     return np.asarray(np.bincount(where.ravel(), values.ravel(), size), dtype=np.float64)
 
 
-def _transformed(
+def _transform(
     observations: LensObservations, state: LensUnknowns
 ) -> tuple[Array, Array, Array, Array]:
     """Of every match: its point's ray [M, 3], rotation into the view [M, 3, 3], the way between
@@ -224,20 +224,20 @@ def _transformed(
     rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)[point]
     R_cw = np.swapaxes(state.R_wc, 1, 2)[view]
     R = R_cw @ state.R_wc[reference]
-    way = _applied(R_cw, state.centres[reference] - state.centres[view])
-    return rays, R, way, _applied(R, rays) + state.rho[point, None] * way
+    way = _apply(R_cw, state.centres[reference] - state.centres[view])
+    return rays, R, way, _apply(R, rays) + state.rho[point, None] * way
 
 
 def residuals(observations: LensObservations, state: LensUnknowns) -> Array:
     """[M, 2] of the normalised plane as it was seen."""
-    Y = _transformed(observations, state)[-1]
+    Y = _transform(observations, state)[-1]
     return seen_at(Y[:, :2] / np.maximum(Y[:, 2:], MIN_Z), state.lens) - observations.matches
 
 
 def _derivatives(observations: LensObservations, state: LensUnknowns) -> tuple[Array, Array, Array]:
     """Residuals [M, 2], their derivatives [M, 2, 12 + TERMS] by the columns of ``_columns``, and
     [M, 2] by rho."""
-    rays, R, way, Y = _transformed(observations, state)
+    rays, R, way, Y = _transform(observations, state)
     z = np.maximum(Y[:, 2], MIN_Z)
     at = Y[:, :2] / z[:, None]
     project = np.zeros((len(at), 2, 3))
@@ -250,13 +250,13 @@ def _derivatives(observations: LensObservations, state: LensUnknowns) -> tuple[A
     by_errors = by_lens(at, state.lens) - D @ R[:, :, :2] @ bent
     parts = [by_centre, -D @ R @ hat(rays), -by_centre, D @ hat(Y), by_errors]
     error = seen_at(at, state.lens) - observations.matches
-    return error, np.concatenate(parts, axis=2), _applied(D, way)
+    return error, np.concatenate(parts, axis=2), _apply(D, way)
 
 
-def triangulated(observations: LensObservations, state: LensUnknowns) -> Array:
+def triangulate(observations: LensObservations, state: LensUnknowns) -> Array:
     """[P] inverse depths, linear least squares."""
-    rays, R, way, _ = _transformed(observations, state)
-    at_infinity, match = _applied(R, rays), rays_of(observations.matches, state.lens)
+    rays, R, way, _ = _transform(observations, state)
+    at_infinity, match = _apply(R, rays), rays_of(observations.matches, state.lens)
     slope = way[:, :2] - match * way[:, 2:]
     value = match * at_infinity[:, 2:] - at_infinity[:, :2]
     count, point = len(state.rho), observations.point
@@ -264,7 +264,7 @@ def triangulated(observations: LensObservations, state: LensUnknowns) -> Array:
     return np.asarray(top / np.maximum(np.bincount(point, np.sum(slope**2, axis=1), count), 1e-18))
 
 
-def _applied(
+def _apply(
     R: Array,  # [M, r, 3]
     vectors: Array,  # [M, 3]
 ) -> Array:

@@ -55,7 +55,7 @@ class _Points:
         self.seen: list[list[Seen]] = []
         self._owner: dict[Seen, int] = {}
 
-    def known(self, keypoint: Seen) -> bool:
+    def is_known(self, keypoint: Seen) -> bool:
         return keypoint in self._owner
 
     def add(self, a: Seen, b: Seen) -> None:
@@ -71,7 +71,9 @@ class _Points:
             self._owner[b] = point
 
 
-def matched(views: Sequence[LensView], pairs: Iterable[tuple[int, int]]) -> LensObservations | None:
+def match_pixels(
+    views: Sequence[LensView], pairs: Iterable[tuple[int, int]]
+) -> LensObservations | None:
     """Points seen in several of ``views``, by matches of ``pairs`` (i, j) with i < j; None for too
     few. A keypoint belongs to one point, so that no match counts twice."""
     points = _Points()
@@ -79,8 +81,8 @@ def matched(views: Sequence[LensView], pairs: Iterable[tuple[int, int]]) -> Lens
         mine, theirs = match_keypoints(views[i].keypoints, views[j].keypoints)
         if len(mine) < MIN_PAIR_MATCHES:
             continue
-        known = np.array([points.known((i, a)) for a in mine.tolist()])
-        for row in _chosen(known).tolist():
+        known = np.array([points.is_known((i, a)) for a in mine.tolist()])
+        for row in _choose(known).tolist():
             points.add((i, int(mine[row])), (j, int(theirs[row])))
     seen = [each for each in points.seen if len(each) > 1]
     if sum(len(each) - 1 for each in seen) < MIN_MATCHES:
@@ -96,7 +98,7 @@ def matched(views: Sequence[LensView], pairs: Iterable[tuple[int, int]]) -> Lens
     )
 
 
-def _chosen(
+def _choose(
     known: np.ndarray[tuple[int], np.dtype[np.bool_]],  # [M] whether another view sees it too
 ) -> Index:
     """Rows of the matches used: first of points that other views see, then an even choice."""

@@ -70,7 +70,7 @@ class LensViews:
         """Leave out every other view."""
         self._views, self._spacing = self._views[::2], 2.0 * self._spacing
 
-    def posed(self, poses: Mapping[int, Sim3]) -> list[LensView]:
+    def posed_views(self, poses: Mapping[int, Sim3]) -> list[LensView]:
         """Those of the sub-map with most views, with the poses by frame index."""
         seen = [view for view in self._views if view.frame_index in poses]
         if not seen:

@@ -13,7 +13,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
-from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated, fused_pointmap
+from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrate, fused_pointmap
 from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.learned.scaling import LearnedDepth, agreement, unscaled_depth
 from aquaflow.tracking.pose.problem import pose_problem
@@ -96,7 +96,7 @@ class MapStart:
             return None
         with self._failures.contain("initialisation", initialiser.frame.index):
             started = self._solve(initialiser)
-        return self._taken(started)
+        return self._take_started(started)
 
     def begin_learned(self) -> NewMap | None:
         """A map from the reference and the picture after it, by the prior's ranges; None where it
@@ -105,10 +105,10 @@ class MapStart:
         if initialiser is None or len(initialiser.waiting) != 1:
             return None
         with self._failures.contain("learned start", initialiser.frame.index):
-            started = self._begun(initialiser)
-        return self._taken(started)
+            started = self._begin_map(initialiser)
+        return self._take_started(started)
 
-    def _begun(self, initialiser: Initialiser) -> NewMap | None:
+    def _begin_map(self, initialiser: Initialiser) -> NewMap | None:
         reference, second = initialiser.frame, initialiser.waiting[0]
         camera = initialiser.reference.camera
         found = learned_start(second.pair, camera, self._config)
@@ -117,7 +117,7 @@ class MapStart:
         posed = [PosedFrame(second.frame, found.T_fk, second.pair)]
         return NewMap(reference, initialiser.reference, found.pointmap, camera, 0.0, posed)
 
-    def _taken(self, started: NewMap | None) -> NewMap | None:
+    def _take_started(self, started: NewMap | None) -> NewMap | None:
         """The frames of a map that starts are in hand, and no reference is waited for."""
         if started is not None:
             frames = [started.reference, *(posed.frame for posed in started.posed)]
@@ -129,7 +129,7 @@ class MapStart:
         solution = initialiser.solve()
         if solution is None:
             return None
-        reference, camera = initialiser.frame, calibrated(solution.camera)
+        reference, camera = initialiser.frame, calibrate(solution.camera)
         encoding = self._prior.encode(reference.image, camera, reference.mask)
         pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
         pair = max(solution.waiting, key=lambda waiting: waiting.parallax_px).pair
@@ -193,7 +193,7 @@ def learned_start(
     depth_b = unscaled_depth(camera, pair.X_b, pair.Q_b)
     if depth_a is None or depth_b is None or _sigma(depth_a) > config.learned.start_sigma:
         return None
-    estimate, honesty = _posed(pair, camera, depth_a, depth_b, config)
+    estimate, honesty = _pose(pair, camera, depth_a, depth_b, config)
     if estimate is None or estimate.inlier_share < config.initialisation.min_explained:
         return None
     honest = unscaled_depth(camera, pair.X_a, pair.Q_a, max(honesty, 1.0))
@@ -207,7 +207,7 @@ def _sigma(depth: LearnedDepth) -> float:
     return float(np.sqrt(np.median(depth.variance[depth.known])))
 
 
-def _posed(
+def _pose(
     pair: PairGeometry,
     camera: CameraModel,
     depth_a: LearnedDepth,
@@ -220,7 +220,7 @@ def _posed(
         return None, 1.0
     step = -(-len(rows) // MATCHES)
     rows, columns = rows[::step], columns[::step]
-    pointmap = replace(Pointmap.unknown(camera), learned=depth_a.kept).completed(1.0)
+    pointmap = replace(Pointmap.unknown(camera), learned=depth_a.kept).complete(1.0)
     pixels_a = np.stack([columns + 0.5, rows + 0.5], -1)
     pixels_b = pair.matches[rows, columns].astype(np.float64)
     weights = pair.C[rows, columns].astype(np.float64)

@@ -35,7 +35,7 @@ class RelativePoses:
         with self._failures.contain("pose", tracked.frame.index):
             T_kf = self._keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
             return RelativeFrame(tracked, T_kf.if_finite())
-        return RelativeFrame(self._lost(tracked))
+        return RelativeFrame(self._lost_frame(tracked))
 
     def world_pose(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
         """The frame with the pose and sub-map that its keyframe gives it now; lost if none."""
@@ -45,8 +45,8 @@ class RelativePoses:
         with self._failures.contain("pose", tracked.frame.index):
             T_wc = (keyframe.T_wc @ T_kf).if_finite()
             return replace(tracked, T_wc=T_wc, sub_map=keyframe.sub_map)
-        return self._lost(tracked)
+        return self._lost_frame(tracked)
 
-    def _lost(self, tracked: Tracked) -> Tracked:
+    def _lost_frame(self, tracked: Tracked) -> Tracked:
         reason = self._failures.reason(tracked.frame.index) or "tracking failed"
-        return Tracked.lost(tracked.frame, tracked.sub_map, reason)
+        return Tracked.as_lost(tracked.frame, tracked.sub_map, reason)

@@ -15,7 +15,7 @@ from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import Revisit
 from aquaflow.tracking.pose.depth_fusion import MOST_FUSED
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.revisits import revisited
+from aquaflow.tracking.revisits import find_revisit
 
 DOUBT = 0.05
 """Relative sigma of depths that are to be triangulated anew, at least: three frames outweigh it."""
@@ -77,7 +77,7 @@ class Repairs:
             revisit = None
             if aside:
                 pointmap, _ = tracker.pointmap(at, frame.solved, frame.camera)
-                revisit = revisited(at, frame.solved, back[0], back[1], pointmap)
+                revisit = find_revisit(at, frame.solved, back[0], back[1], pointmap)
                 tracker.neighbours.set_aside(at.keyframe)
             tracker.take_up(back[0])
             self._monitor.counts.relocalised += 1
@@ -96,7 +96,7 @@ def rescale(at: CurrentKeyframe, ratio: float) -> None:
     by 2 to 8 % within ten frames).
     """
     pointmap = at.keyframe.pointmap
-    known = pointmap.known(1.0)
+    known = pointmap.is_known(1.0)
     pointmap.rho *= ratio
     pointmap.variance[known] *= ratio**2
     pointmap.fused = MOST_FUSED
@@ -107,7 +107,7 @@ def rescale(at: CurrentKeyframe, ratio: float) -> None:
 
 def doubt(pointmap: Pointmap) -> None:
     """Let the next frames' depths replace those of ``pointmap``, which stay known until then."""
-    known = pointmap.known(1.0)
+    known = pointmap.is_known(1.0)
     least = (DOUBT * pointmap.rho) ** 2
     pointmap.variance[known] = np.maximum(pointmap.variance, least)[known]
     pointmap.fused = 0

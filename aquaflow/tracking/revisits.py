@@ -10,7 +10,7 @@ from aquaflow.tracking.current_keyframe import CurrentKeyframe
 from aquaflow.tracking.depth_ratio import depth_ratio
 from aquaflow.tracking.frames import Revisit
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.pose.visibility import sampled
+from aquaflow.tracking.pose.visibility import sample
 
 RATIO_POINTS = 500
 """Points whose depths are compared to join two keyframes."""
@@ -20,7 +20,7 @@ LEAST_SCALE_SIGMA = 0.005
 """Relative; as much as a link along the path may lose (``LINK_SCALE_SIGMA`` of tracking/graph)."""
 
 
-def revisited(
+def find_revisit(
     at: CurrentKeyframe,
     solved: Matched,
     back: CurrentKeyframe,
@@ -32,7 +32,7 @@ def revisited(
     ``pointmap``: the frame's depths in the unit of ``at``; None where too few of them are known.
     """
     earlier = back.keyframe.pointmap
-    points = sampled(earlier, earlier.known(KNOWN_SIGMA), RATIO_POINTS)[2]
+    points = sample(earlier, earlier.is_known(KNOWN_SIGMA), RATIO_POINTS)[2]
     ratio = depth_ratio(points, solved_back.estimate.T, pointmap, KNOWN_SIGMA)
     if ratio is None:
         return None

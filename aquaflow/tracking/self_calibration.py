@@ -17,7 +17,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.lens_error import TERMS
 from aquaflow.tracking.lens_adjustment import LensAdjustment, adjust_lens, model_error
 from aquaflow.tracking.lens_equations import Array, LensObservations
-from aquaflow.tracking.lens_matches import LensView, matched
+from aquaflow.tracking.lens_matches import LensView, match_pixels
 
 MIN_VIEWS = 6
 """With fewer, the scatter between the views is no estimate."""
@@ -27,7 +27,7 @@ show the focal length, which is a matter of wide angles."""
 SYSTEMATIC = np.array([10.0, 5.0])
 """Standard deviations of log focal length and k1, over the noise of the matches (normalised units),
 that no scatter between views shows: keypoints are pulled along edges and by the pixels' grid the
-same way everywhere. Measured on synthetic dives (docs/measurements.md#self-calibration)."""
+same way everywhere. Measured on synthetic dives (notes/measurements.md#self-calibration)."""
 KNOWN_SIGMA = 0.1
 """Of the log focal length; above, the dive hardly says more than the guess."""
 
@@ -64,13 +64,13 @@ def found_lens(
     """The lens that ``views`` of one guessed camera show; None if they are too few."""
     if len(views) < MIN_VIEWS:
         return None
-    observations = matched(views, pairs_of(len(views)))
+    observations = match_pixels(views, pairs_of(len(views)))
     if observations is None:
         return None
     R_wc = np.stack([view.T_wc.R for view in views])
     centres = np.stack([view.T_wc.t for view in views])
     try:
-        return estimated(observations, R_wc, centres, start)
+        return estimate(observations, R_wc, centres, start)
     except np.linalg.LinAlgError:
         return None
 
@@ -80,7 +80,7 @@ def pairs_of(views: int) -> list[tuple[int, int]]:
     return [(i, i + step) for i in range(views) for step in STEPS if i + step < views]
 
 
-def estimated(
+def estimate(
     observations: LensObservations,
     R_wc: Array,  # [V, 3, 3]
     centres: Array,  # [V, 3]
@@ -103,10 +103,10 @@ def estimated(
     covariance = simple.covariance + model_error(simple, full) + shared
     if not np.isfinite(covariance).all():
         raise np.linalg.LinAlgError("the matches determine no lens")
-    return _found(simple, covariance, observations)
+    return _found_lens_of(simple, covariance, observations)
 
 
-def _found(
+def _found_lens_of(
     simple: LensAdjustment,
     covariance: Array,  # [2, 2]
     observations: LensObservations,

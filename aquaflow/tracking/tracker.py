@@ -26,7 +26,7 @@ from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart, NewMap
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
-from aquaflow.tracking.revisits import revisited
+from aquaflow.tracking.revisits import find_revisit
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 
@@ -138,7 +138,7 @@ class Tracker:
         return replace(edges, frames=self._waiting.settle(decided, self._as_lost))
 
     def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
-        return Tracked.lost(frame, self.sub_map, self._failures.reason(frame.index) or reason)
+        return Tracked.as_lost(frame, self.sub_map, self._failures.reason(frame.index) or reason)
 
     def _track(self, frame: Frame) -> list[Tracked]:
         encoding = self._encode(frame)
@@ -187,7 +187,7 @@ class Tracker:
         first, encoding, pointmap = started.reference, started.encoding, started.pointmap
         new = self._keyframe_tracker.at_new_keyframe
         at = self._at = new(first, encoding, self._origin, pointmap, self.sub_map)
-        tracked = [at.tracked(first, FrameClass.KEYFRAME, Quality(), pointmap.copy())]
+        tracked = [at.tracked_result(first, FrameClass.KEYFRAME, Quality(), pointmap.copy())]
         at.T_fk = started.T_waiting
         tracked += self._back_fill()
         for posed in started.posed:
@@ -241,10 +241,10 @@ class Tracker:
         look = partial(self._returning.search, due)
         for found in self._worker.ask(RETURN, frame.index, look):
             with self._failures.contain(RETURN, frame.index):
-                self._note(self.looked(found))
+                self._note(self.return_to(found))
         return self._returning.was_in_vain(at)
 
-    def looked(self, found: ReuseResult) -> Revisit | None:
+    def return_to(self, found: ReuseResult) -> Revisit | None:
         """Go on at an earlier keyframe that shows the frame of a look, unless tracking has left
         the one that was in use then; what that says of the two keyframes."""
         look, at = found.look, found.look.at
@@ -282,7 +282,7 @@ class Tracker:
             return None
         self._joined.add(pair)
         pointmap, _ = self._keyframe_tracker.pointmap(at, solved, camera)
-        return revisited(at, solved, back, solved_back, pointmap)
+        return find_revisit(at, solved, back, solved_back, pointmap)
 
     # --- loss -----------------------------------------------------------------------------------
 
@@ -331,7 +331,7 @@ class Tracker:
     ) -> Tracked | None:
         """Pose, fusion and class of one frame; None if no pose is found."""
         with self._failures.contain("pose", frame.index):
-            return self._placed(frame, encoding, pair)
+            return self._place(frame, encoding, pair)
         return None
 
     def _expect(self, at: CurrentKeyframe, frame: Frame) -> None:
@@ -343,9 +343,7 @@ class Tracker:
         at.measured = motion is not None
         at.motion = motion or at.motion
 
-    def _placed(
-        self, frame: Frame, encoding: Encoding, pair: PairGeometry | None
-    ) -> Tracked | None:
+    def _place(self, frame: Frame, encoding: Encoding, pair: PairGeometry | None) -> Tracked | None:
         assert self._at is not None
         assert self.camera is not None
         at, camera, keyframe_tracker = self._at, self.camera, self._keyframe_tracker
@@ -357,7 +355,7 @@ class Tracker:
             return None
         keyframe_tracker.take(at, solved, camera)
         at.t_ns = frame.t_ns
-        if keyframe_tracker.hidden(solved):
+        if keyframe_tracker.is_hidden(solved):
             frame = keyframe_tracker.without_hidden(frame, at, solved, camera)
         frame_class = keyframe_tracker.classify(at, solved, camera)
         self._solved = solved
@@ -365,13 +363,13 @@ class Tracker:
             due = self._becomes_keyframe(frame, at, solved, encoding, camera)
             frame_class = FrameClass.KEYFRAME if due else FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
-            return self._at.tracked(frame, frame_class, self._solved.quality)
+            return self._at.tracked_result(frame, frame_class, self._solved.quality)
         pointmap, depth = keyframe_tracker.pointmap(at, solved, camera)
         if depth is not None:
             frame, pointmap = keyframe_tracker.without_moving(frame, at, solved, pointmap, depth)
         if frame_class is FrameClass.MAPPING:
             at.mapped_parallax_px = solved.parallax_px
-            return at.tracked(frame, frame_class, solved.quality, pointmap.copy())
+            return at.tracked_result(frame, frame_class, solved.quality, pointmap.copy())
         estimate = solved.estimate
         link = KeyframeEdge(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
         self.sub_map = at.keyframe.sub_map
@@ -381,4 +379,4 @@ class Tracker:
         new = keyframe_tracker.at_new_keyframe
         self._at = new(frame, encoding, at.T_wc, pointmap, self.sub_map, at.motion)
         self._edges.links[self._at.keyframe.number] = link
-        return self._at.tracked(frame, frame_class, solved.quality, pointmap.copy())
+        return self._at.tracked_result(frame, frame_class, solved.quality, pointmap.copy())

@@ -134,7 +134,7 @@ class WideSteps:
         pair = self._prior.decode(reference, encoding, seed)
         if matched_share(keyframe.encoding, pair) < RECOVERED_SUPPORT:
             return None
-        known = pointmap.known(config.known_sigma)
+        known = pointmap.is_known(config.known_sigma)
         T_fk = turning_step(pointmap, pair, known, camera, predicted)
         if T_fk is None:
             return None
@@ -180,7 +180,7 @@ def keypoint_poses(
     mine, theirs = match_keypoints(keyframe.encoding.keypoints, encoding.keypoints)
     pixels_k = keyframe.encoding.keypoints.pixels[mine].astype(np.float64)
     pixels = encoding.keypoints.pixels[theirs].astype(np.float64)
-    left = at_pixels(keyframe.pointmap.known(known_sigma), pixels_k)
+    left = at_pixels(keyframe.pointmap.is_known(known_sigma), pixels_k)
     poses: list[Sim3] = []
     while len(poses) < HYPOTHESES and left.sum() >= LEAST_INLIERS:
         problem = pose_problem(keyframe.pointmap, pixels_k[left], pixels[left], camera, SIGMA_PX)

@@ -50,7 +50,7 @@ class WaterParameters:
         """exp(-beta_a z) [..., 3]."""
         return torch.exp(-_optical_depth(self.beta_a, z))
 
-    def stacked(self) -> Tensor:
+    def stack(self) -> Tensor:
         """[5, 3] in the order that the fused kernel takes."""
         return torch.stack([self.beta_a, self.B_inf, self.b, self.B_res, self.d])
 

@@ -75,8 +75,8 @@ class WaterModel(WaterUnknowns):
         d: Array,  # [3] 1 / map unit
         priors: WaterPriorsConfig = BELIEVED,
     ) -> None:
-        super().__init__(model, int(seen.view.max()) + 1, seen.median_range, priors)
-        self.seen = seen
+        super().__init__(model, int(seen.view.max()) + 1, seen.median_range)
+        self.seen, self.believed = seen, priors
         self._regions = RegionalColours(seen.region)
         self._B_res, self._d = B_res, d
         self._near = B_res[:, None] * np.exp(-d[:, None] * seen.z)

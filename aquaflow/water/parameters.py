@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import Self
 
-from aquaflow.config import WaterPriorsConfig
 from aquaflow.water.shading import TERMS
 
 Array = npt.NDArray[np.float64]
@@ -29,8 +28,6 @@ RATE_RATIO_SIGMA = 0.5
 """Prior: log of b over beta_a; both come from the same absorption and scattering."""
 B_INF_LOGIT, B_INF_SIGMA = -1.0, 1.5
 """Prior: logit of B_inf (0.27), weak."""
-WHITE_SIGMA = 0.5
-"""Prior, if believed: logit of a channel's B_inf over the mean of all (white backscatter)."""
 UNEVEN_SIGMA = np.array([0.2, 0.5, 0.15, 0.1, 0.15])
 """Prior: log-gain of the backscatter at the edge of the picture, by term; sunlit water is several
 times as bright looked at horizontally as from above, a little brighter towards the sun, and changes
@@ -112,11 +109,9 @@ class WaterUnknowns:
     In the order log beta_a, log b, logit B_inf, unevenness, shading, exposures.
     """
 
-    def __init__(
-        self, model: Model, views: int, median_range: float, priors: WaterPriorsConfig
-    ) -> None:
+    def __init__(self, model: Model, views: int, median_range: float) -> None:
         """``median_range`` of what is seen, map units: rates are expected relative to it."""
-        self.model, self.views, self.believed = model, views, priors
+        self.model, self.views = model, views
         self.median_range = median_range
         sizes = (
             WATER * model.water,
@@ -211,8 +206,4 @@ class WaterUnknowns:
             rows[self.exposure, self.exposure] = np.kron(
                 np.eye(self.views), GREY / (np.sqrt(3.0) * exposure) + (np.eye(3) - GREY) / tint
             )
-        if self.model.water and self.believed.white_backscatter:
-            white = np.zeros((3, self.size))
-            white[:, 6:WATER] = (np.eye(3) - GREY) / WHITE_SIGMA
-            rows = np.vstack([rows, white])
         return rows

@@ -12,7 +12,7 @@ PICTURES_AT_ONCE = 4
 """Pictures worked on between two pauses: each takes 2 to 5 ms."""
 
 
-def finished(steps: Generator[None, None, Result]) -> Result:
+def run_to_end(steps: Generator[None, None, Result]) -> Result:
     """What a computation with pauses ends with, its pauses left out."""
     while True:
         try:

@@ -70,9 +70,9 @@ class PosedPicture:
         """[up to count, 3] places in the world that the picture shows."""
         rows, columns = (random.integers(0, size, count) for size in self._z.shape)
         good = self._solid[rows, columns]
-        return self.lifted(np.stack([columns[good], rows[good]], axis=-1).astype(np.float64) + 0.5)
+        return self.lift(np.stack([columns[good], rows[good]], axis=-1).astype(np.float64) + 0.5)
 
-    def lifted(
+    def lift(
         self,
         pixels: Array,  # [..., 2] px
     ) -> Array:
@@ -82,7 +82,7 @@ class PosedPicture:
         rays *= (self._z[rows, columns] / np.linalg.norm(rays, axis=-1))[..., None]
         return np.asarray(self.T_wc.t + rays @ self.T_wc.R.T)
 
-    def located(
+    def locate(
         self,
         places: Array,  # [..., 3] world
     ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
@@ -97,7 +97,7 @@ class PosedPicture:
         there = np.abs(self._z[rows, columns] - z) < AGREEING * z
         return pixels, z, ahead & inside & there & self._solid[rows, columns]
 
-    def sampled(
+    def sample(
         self,
         pixels: Array,  # [N, K, 2] px
         aperture: Array,  # [N] px, standard deviation of what one sample averages

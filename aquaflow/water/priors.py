@@ -14,12 +14,8 @@ Array = npt.NDArray[np.float64]
 DARK_SHARE, DARK_LEVEL, DARK_SIGMA = 0.02, 0.02, 0.2
 """The darkest 2 % of the points are shadows, nearly black (dark channel, He et al. 2011). Weak, as
 sand has none: beta_a of six known waters is 9 % wrong with a sigma of 0.1, 7 % with 0.2 and 0.5."""
-GREY_SIGMA = 0.2
-"""Log of a channel's mean over that of all: a scene is grey on the whole (grey world)."""
 BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA = 0.02, 1.0, 0.2
 """Only the brightest 2 % of the points may be brighter than the camera's white (saturation)."""
-LEAST_MEAN = 1e-3
-"""Guards the logarithm: in every channel something of a scene is lighter than black."""
 
 
 @dataclass(frozen=True)
@@ -39,16 +35,14 @@ def beliefs(
     found: list[Belief] = []
     for c in range(3):
         if config.dark_channel:
-            found.append(_ranked(J, c, DARK_SHARE, DARK_LEVEL, DARK_SIGMA))
+            found.append(_rank(J, c, DARK_SHARE, DARK_LEVEL, DARK_SIGMA))
         if config.saturation:
-            bright = _ranked(J, c, 1.0 - BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA)
+            bright = _rank(J, c, 1.0 - BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA)
             found += [bright] if bright.residual > 0.0 else []
-        if config.grey_world:
-            found.append(_grey(J, c))
     return found
 
 
-def _ranked(
+def _rank(
     J: Array,  # [3, P]
     c: int,
     share: float,
@@ -61,15 +55,3 @@ def _ranked(
     by_J = np.zeros(J.shape[1])
     by_J[point] = 1.0 / sigma
     return Belief(float((J[c, point] - level) / sigma), {c: by_J})
-
-
-def _grey(
-    J: Array,  # [3, P]
-    c: int,
-) -> Belief:
-    """The channel's mean against the geometric mean of all three."""
-    means = np.maximum(J.mean(axis=1), LEAST_MEAN)
-    share = (np.arange(3) == c) - 1.0 / 3.0
-    slope = np.where(means > LEAST_MEAN, share / (means * GREY_SIGMA), 0.0) / J.shape[1]
-    residual = float(share @ np.log(means) / GREY_SIGMA)
-    return Belief(residual, {k: np.full(J.shape[1], slope[k]) for k in range(3)})

@@ -75,7 +75,7 @@ class RegionalColours:
         if self.number == 0:
             return np.zeros(0)
         mean, deviation, _ = self._moments(J)
-        return self._whitened(np.log(np.stack([mean, deviation]) + LEAST)).reshape(-1)
+        return self._whiten(np.log(np.stack([mean, deviation]) + LEAST)).reshape(-1)
 
     def rows(
         self,
@@ -94,9 +94,9 @@ class RegionalColours:
             of_deviation /= np.maximum(deviation[c], LEAST)[:, None]
             logs[0, c][:, own] = of_mean / (mean[c] + LEAST)[:, None]
             logs[1, c][:, own] = of_deviation / (deviation[c] + LEAST)[:, None]
-        return self._whitened(logs).reshape(6 * self.number, size)
+        return self._whiten(logs).reshape(6 * self.number, size)
 
-    def _whitened(
+    def _whiten(
         self,
         logs: Array,  # [2, 3, R, ...] of RGB
     ) -> Array:

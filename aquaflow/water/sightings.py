@@ -51,7 +51,7 @@ def sighting(
 ) -> Generator[None, None, Observations]:
     """Observations of a random choice of the surface that several of the pictures, at least one,
     show; with pauses."""
-    places, ranges = _drawn(pictures, random)
+    places, ranges = _draw(pictures, random)
     yield
     samples, sigma = _patches(pictures, places, ranges)
     yield
@@ -60,7 +60,7 @@ def sighting(
     seen = np.isfinite(ranges) & whole_patches[:, None]
     for number, picture in enumerate(pictures):
         own = np.nonzero(seen[:, number])[0]
-        *found, whole = _observed(picture, samples[own], sigma[own])
+        *found, whole = _observe(picture, samples[own], sigma[own])
         for table, values in zip((colour, z, xy), found, strict=True):
             table[own, number] = values
         seen[own, number] = whole
@@ -74,7 +74,7 @@ def sighting(
     )
 
 
-def _drawn(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tuple[Array, Array]:
+def _draw(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tuple[Array, Array]:
     """Places [P, 3] in the world, and their range [P, V] in the views that are used; inf in
     others."""
     each = -(-CANDIDATES // max(len(pictures), 1))
@@ -83,7 +83,7 @@ def _drawn(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tup
     )
     ranges = np.full((len(places), len(pictures)), np.inf)
     for number, picture in enumerate(pictures):
-        _, z, seen = picture.located(places)
+        _, z, seen = picture.locate(places)
         ranges[seen, number] = z[seen]
     several = np.isfinite(ranges).sum(axis=1) >= MIN_VIEWS
     places, ranges = places[several], ranges[several]
@@ -122,17 +122,17 @@ def _patches(
     samples = np.full((len(places), len(grid), 3), np.nan)
     for number, picture in enumerate(pictures):
         own = np.nonzero(nearest == number)[0]
-        pixels, z, _ = picture.located(places[own])
+        pixels, z, _ = picture.locate(places[own])
         pixels = pixels[:, None] + (sigma[own] * picture.focal / z)[:, None, None] * grid
-        lifted = picture.lifted(pixels)
-        whole = picture.located(lifted)[2].all(axis=1)
-        colours = picture.sampled(pixels, _aperture(picture, sigma[own], z))
+        lifted = picture.lift(pixels)
+        whole = picture.locate(lifted)[2].all(axis=1)
+        colours = picture.sample(pixels, _aperture(picture, sigma[own], z))
         whole &= colours.mean(axis=-1).std(axis=1) > LEAST_TEXTURE
         samples[own[whole]] = lifted[whole]
     return samples, sigma
 
 
-def _observed(
+def _observe(
     picture: PosedPicture,
     samples: Array,  # [N, K, 3] world
     sigma: Array,  # [N] map units
@@ -140,9 +140,9 @@ def _observed(
     """Of each patch colour [N, 3], range [N, 1], place in the picture [N, 2], and whether it is
     seen [N]."""
     _, weight = _grid()
-    pixels, z, seen = picture.located(samples)
+    pixels, z, seen = picture.locate(samples)
     z = z @ weight
-    colours = picture.sampled(pixels, _aperture(picture, sigma, z))
+    colours = picture.sample(pixels, _aperture(picture, sigma, z))
     colour = np.einsum("k,nkc->nc", weight, colours)
     size = np.array([picture.camera.width, picture.camera.height])
     xy = np.einsum("k,nkc->nc", weight, pixels) / (0.5 * size) - 1.0

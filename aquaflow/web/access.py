@@ -109,7 +109,7 @@ class Access:
 
     def by_query(self, target: str, headers: Mapping[str, str], peer: str) -> bool:
         """True if the address itself carries the token: it belongs into a cookie then."""
-        return self._accepts(_asked(target), self._client(peer, headers))
+        return self._accepts(_query_tokens(target), self._client(peer, headers))
 
     def shows_token(self, target: str, headers: Mapping[str, str]) -> bool:
         """True if a request shows the token: for its place in the queue, never for data."""
@@ -209,7 +209,7 @@ def _is_local(name: str) -> bool:
 
 def _tokens(target: str, headers: Mapping[str, str]) -> list[str]:
     """What the request shows as token: header, cookie or query."""
-    given = _asked(target)
+    given = _query_tokens(target)
     scheme, _, value = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         given.append(value.strip())
@@ -230,7 +230,7 @@ def path_of(target: str) -> str | None:
         return None
 
 
-def _asked(target: str) -> list[str]:
+def _query_tokens(target: str) -> list[str]:
     """Tokens in the query of a request's target."""
     try:
         return parse_qs(urlsplit(target).query).get("token", [])

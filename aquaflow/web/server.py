@@ -159,7 +159,7 @@ class WebServer:
 
     async def _serve(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
         """The application, as ASGI calls it."""
-        headers = _named(scope["headers"])
+        headers = _headers_by_name(scope["headers"])
         query = scope["query_string"].decode("latin-1")
         target = scope["raw_path"].decode("latin-1") + (f"?{query}" if query else "")
         peer = scope["client"][0] if scope["client"] else ""
@@ -206,7 +206,7 @@ def _hand_over(made: asyncio.Future[HttpResponse], answer: HttpResponse) -> None
         made.set_result(answer)
 
 
-def _named(pairs: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
+def _headers_by_name(pairs: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
     """Headers by lower-case name; those that came twice are joined (RFC 9110, 5.3)."""
     named: dict[str, str] = {}
     for raw, value in pairs:

@@ -58,9 +58,9 @@ def _of_host(host: str, port: int) -> list[FoundDevice]:
             picture += "" if status.get("running", True) else ", not running"
         except (KeyError, TypeError, AttributeError, ValueError):
             continue  # of another version than those that are known
-        served = [_served(host, url, name, picture) for url in urls if url.scheme in SCHEMES]
+        served = [_serve(host, url, name, picture) for url in urls if url.scheme in SCHEMES]
         sent = ports and all(url.scheme == "udp" for url in urls)
-        found += [_sent(host, urls, name, picture)] if sent else served
+        found += [_send(host, urls, name, picture)] if sent else served
     return found
 
 
@@ -71,7 +71,7 @@ def _picture(configuration: dict[str, Any]) -> str:
     return f"{codec}, {size[0]} x {size[1]}" if all(size) else codec
 
 
-def _served(host: str, url: SplitResult, name: str, picture: str) -> FoundDevice:
+def _serve(host: str, url: SplitResult, name: str, picture: str) -> FoundDevice:
     """By RTSP. The manager names the interface that it listens on, which may be any."""
     scheme = "rtsps" if url.scheme == "rtsps" else "rtsp"
     there = url._replace(scheme=scheme, netloc=netloc(host, url.port or RTSP_PORT)).geturl()
@@ -79,7 +79,7 @@ def _served(host: str, url: SplitResult, name: str, picture: str) -> FoundDevice
     return FoundDevice("stream", there, f"BlueOS: {name}", picture, config)
 
 
-def _sent(host: str, urls: list[SplitResult], name: str, picture: str) -> FoundDevice:
+def _send(host: str, urls: list[SplitResult], name: str, picture: str) -> FoundDevice:
     """By UDP, to this computer or, until an endpoint is added, to others only."""
     own = _own_address(host)
     ours = (own, *HERE) if _is_loopback(own) else (own,)

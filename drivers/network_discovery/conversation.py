@@ -45,7 +45,9 @@ def of_each(items: Iterable[Item], ask: Callable[[Item], list[T]]) -> list[T]:
     return [each for devices in found.values() for each in devices]
 
 
-def said(address: Address, request: bytes = b"", enough: Callable[[bytes], bool] = bool) -> bytes:
+def ask_server(
+    address: Address, request: bytes = b"", enough: Callable[[bytes], bool] = bool
+) -> bytes:
     """What a TCP server says, to ``request`` if there is one, until it is ``enough`` or time is up;
     nothing where there is no server."""
     heard = b""

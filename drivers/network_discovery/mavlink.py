@@ -9,11 +9,11 @@ from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.mavlink_dialect import dialect as mavlink_dialect
 from aquaflow.drivers.network_discovery.conversation import (
     Address,
+    ask_server,
     datagrams,
     json_of,
     listener_at,
     of_each,
-    said,
 )
 from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming, header_of
 from aquaflow.drivers.protocol.packets import PacketReader
@@ -64,7 +64,7 @@ def mavlink_links(
         way, address = place
         if way == "udp":
             return _sent_here(dialect, address[1])
-        return _served(dialect, address) if way == "tcp" else _by_rest(address)
+        return _serve(dialect, address) if way == "tcp" else _by_rest(address)
 
     return of_each(places, ask)
 
@@ -78,15 +78,21 @@ def _sent_here(dialect: Any, port: int) -> list[FoundDevice]:
     with listener:
         senders = [sender for data, sender in datagrams(listener) if heard.feed(data)]
     link = {"kind": "udp", "port": port}
-    return _found(heard.autopilots, f"from {senders[0]}", f"udp:{port}", link) if senders else []
+    return (
+        _found_devices(heard.autopilots, f"from {senders[0]}", f"udp:{port}", link)
+        if senders
+        else []
+    )
 
 
-def _served(dialect: Any, address: Address) -> list[FoundDevice]:
+def _serve(dialect: Any, address: Address) -> list[FoundDevice]:
     heard = AutopilotHeartbeats(dialect)
-    heard.feed(said(address, enough=lambda data: bool(AutopilotHeartbeats(dialect).feed(data))))
+    heard.feed(
+        ask_server(address, enough=lambda data: bool(AutopilotHeartbeats(dialect).feed(data)))
+    )
     host, port = address
     link = {"kind": "tcp", "host": host, "port": port}
-    return _found(heard.autopilots, f"at {host}", f"tcp:{host}:{port}", link)
+    return _found_devices(heard.autopilots, f"at {host}", f"tcp:{host}:{port}", link)
 
 
 def _by_rest(address: Address) -> list[FoundDevice]:
@@ -99,7 +105,9 @@ def _by_rest(address: Address) -> list[FoundDevice]:
             continue
         kind = kind.removeprefix("MAV_TYPE_").replace("_", " ").lower()
         link = {"kind": "mavlink2rest", "url": f"ws://{host}:{port}"}
-        return _found([Autopilot(1, 1, kind)], f"by mavlink2rest at {host}", link["url"], link)
+        return _found_devices(
+            [Autopilot(1, 1, kind)], f"by mavlink2rest at {host}", link["url"], link
+        )
     return []
 
 
@@ -130,7 +138,7 @@ def _kind_of(dialect: Any, number: int) -> str:
     return name.removeprefix("MAV_TYPE_").replace("_", " ").lower()
 
 
-def _found(
+def _found_devices(
     autopilots: Sequence[Autopilot], place: str, identity: str, link: dict[str, Any]
 ) -> list[FoundDevice]:
     """One for each autopilot."""

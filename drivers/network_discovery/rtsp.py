@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from aquaflow.drivers.network_discovery.blueos import PORT, netloc, rtsp_ports
-from aquaflow.drivers.network_discovery.conversation import Address, of_each, said
+from aquaflow.drivers.network_discovery.conversation import Address, ask_server, of_each
 from aquaflow.sources.discovery import FoundDevice
 
 PORTS = (8554, 554)
@@ -29,7 +29,7 @@ def _server(address: Address) -> list[FoundDevice]:
     """An RTSP server, asked what it can do (OPTIONS)."""
     url = f"rtsp://{netloc(*address)}/"
     request = f"OPTIONS {url} RTSP/1.0\r\nCSeq: 1\r\n\r\n".encode()
-    answer = said(address, request, lambda heard: b"\r\n" in heard)
+    answer = ask_server(address, request, lambda heard: b"\r\n" in heard)
     if not answer.startswith(b"RTSP/1."):
         return []
     detail = "an RTSP server: put the path of its stream behind the address, as its page says"

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from functools import partial
 
-from aquaflow.drivers.network_discovery.conversation import Address, answers_to, of_each, said
+from aquaflow.drivers.network_discovery.conversation import Address, answers_to, ask_server, of_each
 from aquaflow.sources.discovery import FoundDevice
 
 PORT = 16171
@@ -29,11 +29,11 @@ def waterlinked_dvls(
     """DVLs that are heard at ``hosts``, at their usual addresses, or where their name leads to."""
     if not hosts:
         return []
-    named = of_each([group], _named)
-    return of_each([*hosts, *USUAL_HOSTS, *named], partial(_heard, port=port))
+    named = of_each([group], _resolve_names)
+    return of_each([*hosts, *USUAL_HOSTS, *named], partial(_find_at, port=port))
 
 
-def _named(group: Address) -> list[str]:
+def _resolve_names(group: Address) -> list[str]:
     """Where the answers come from: their content names the fallback address, whatever it is."""
     answers = answers_to(QUESTION, group)
     return [sender for answer, sender in answers if _is_answer(answer)]
@@ -43,8 +43,8 @@ def _is_answer(packet: bytes) -> bool:
     return len(packet) > 12 and bool(packet[2] & 0x80) and NAME.lower() in packet.lower()
 
 
-def _heard(host: str, port: int) -> list[FoundDevice]:
-    heard = said((host, port), enough=lambda data: _kind(data) is not None)
+def _find_at(host: str, port: int) -> list[FoundDevice]:
+    heard = ask_server((host, port), enough=lambda data: _kind(data) is not None)
     kind = _kind(heard)
     if kind is None:
         return []

@@ -53,7 +53,7 @@ class OakCapture:
             return None
         return RawPicture(
             arrival_ns=arrival_ns,
-            decode=lambda: _decoded(picture),
+            decode=lambda: _decode(picture),
             exposed_ns=picture.exposed_ns,
             device_ns=picture.device_ns,
             sequence=picture.sequence,
@@ -114,8 +114,8 @@ class OakCamera(LiveCamera):
         for reading in readings:
             rate_ns = min(reading.rate_ns, arrival_ns)
             force_ns = min(reading.acceleration_ns, arrival_ns)
-            rate = _turned(rotation, reading.rate_rad_s)
-            force = _turned(rotation, reading.acceleration_m_s2)
+            rate = _turn(rotation, reading.rate_rad_s)
+            force = _turn(rotation, reading.acceleration_m_s2)
             samples: list[AngularRate | Acceleration] = [
                 AngularRate(rate_ns, arrival_ns, self.name, rate),
                 Acceleration(force_ns, arrival_ns, self.name, force),
@@ -145,7 +145,7 @@ class OakCamera(LiveCamera):
         return capture
 
 
-def _turned(
+def _turn(
     rotation: npt.NDArray[np.float64],  # [3, 3]
     vector: tuple[float, float, float],
 ) -> tuple[float, float, float]:
@@ -158,7 +158,7 @@ def _file(picture: OakPicture) -> EncodedPicture | None:
     return None if data is None else EncodedPicture("jpeg", data)
 
 
-def _decoded(picture: OakPicture) -> npt.NDArray[np.uint8]:
+def _decode(picture: OakPicture) -> npt.NDArray[np.uint8]:
     try:
         return picture.decode()
     except ValueError as error:

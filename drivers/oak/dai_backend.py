@@ -141,8 +141,8 @@ class DaiBackend:
     def _output(self, camera: Any, config: OakConfig) -> Any:
         """The camera's pictures, encoded as its link demands."""
         dai, speed = self._dai, self._device.getUsbSpeed().name
-        self._encoding = chosen(config, speed)
-        log.info("the OAK %s is %s", self._id, said(config, speed, self._encoding))
+        self._encoding = choose(config, speed)
+        log.info("the OAK %s is %s", self._id, describe_choice(config, speed, self._encoding))
         kinds = dai.ImgFrame.Type
         output = camera.requestOutput(
             (config.width, config.height),
@@ -251,7 +251,7 @@ JPEG_QUALITY = 95
 """Percent; a tenth of BGR's bytes, and finer than what tracking sees."""
 
 
-def chosen(config: OakConfig, speed: str) -> Encoding:
+def choose(config: OakConfig, speed: str) -> Encoding:
     """As configured, else the best that a link of this ``dai.UsbSpeed`` carries."""
     if config.encoding != "auto":
         return config.encoding
@@ -262,7 +262,7 @@ def chosen(config: OakConfig, speed: str) -> Encoding:
     return "mjpeg"
 
 
-def said(config: OakConfig, speed: str, encoding: Encoding) -> str:
+def describe_choice(config: OakConfig, speed: str, encoding: Encoding) -> str:
     """The choice in words, for the log."""
     link = NAMES.get(speed, "USB 1")
     raw = _rate(config, BYTES_PER_PIXEL["bgr"]) * 1e-6

@@ -26,7 +26,7 @@ class DaiPicture:
         import cv2
 
         if self.is_jpeg:
-            return self._unpacked()
+            return self._unpack()
         try:
             picture = self.message.getCvFrame()
         except RuntimeError as error:
@@ -37,7 +37,7 @@ class DaiPicture:
     def jpeg(self) -> bytes | None:
         return bytes(self.message.getData()) if self.is_jpeg else None
 
-    def _unpacked(self) -> npt.NDArray[np.uint8]:
+    def _unpack(self) -> npt.NDArray[np.uint8]:
         import cv2
 
         data = np.asarray(self.message.getData(), np.uint8)

@@ -14,7 +14,7 @@ from aquaflow.config.can_devices import DbcConfig, DbcSignal
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.packets import PacketDecoder
-from aquaflow.drivers.rotation import Vector, from_euler, normalised
+from aquaflow.drivers.rotation import Vector, from_euler, normalise
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -50,7 +50,7 @@ class DbcDecoder(PacketDecoder):
     def __init__(self, name: str, config: DbcConfig) -> None:
         super().__init__(name, CanFraming())
         self._cantools = load("cantools", f"the CAN device '{name}'")
-        database = self._opened(config.database)
+        database = self._open_file(config.database)
         self._fixes = Fixes(config)
         self._mapped: dict[tuple[int, bool], tuple[Any, list[DbcSignal]]] = {}
         for mapping in config.samples:
@@ -83,7 +83,7 @@ class DbcDecoder(PacketDecoder):
             return self._fixes.fix(t_ns, t_ns, source, scaled[0], scaled[1], sigma_of(None))
         return [_in_body(mapping, scaled, t_ns, source)]
 
-    def _opened(self, path: str) -> Any:
+    def _open_file(self, path: str) -> Any:
         try:
             return self._cantools.database.load_file(path, database_format="dbc")
         except (OSError, ValueError, self._cantools.Error) as error:
@@ -116,9 +116,7 @@ def _in_body(mapping: DbcSignal, scaled: list[float], t_ns: int, source: str) ->
     if mapping.sample == "euler":
         return Attitude(t_ns, t_ns, source, from_euler(*scaled))
     if mapping.sample == "attitude":
-        return Attitude(
-            t_ns, t_ns, source, normalised((scaled[0], scaled[1], scaled[2], scaled[3]))
-        )
+        return Attitude(t_ns, t_ns, source, normalise((scaled[0], scaled[1], scaled[2], scaled[3])))
     if mapping.sample in VECTORS:
         return VECTORS[mapping.sample](t_ns, t_ns, source, (scaled[0], scaled[1], scaled[2]))
     return SCALARS[mapping.sample](t_ns, t_ns, source, scaled[0])

@@ -79,7 +79,7 @@ class MavlinkDecoder(PacketDecoder):
             return []
         name = self._wanted[header.message_id]
         if name in MESSAGES:
-            self._answer(self._commands.acknowledged(header, self._unpacked(packet)))
+            self._answer(self._commands.acknowledge(header, self._unpack(packet)))
             return []
         if (header.system, header.component) == self._senders.autopilot:
             return self._of_autopilot(header, name, packet, arrival_ns)
@@ -88,7 +88,7 @@ class MavlinkDecoder(PacketDecoder):
     def _of_autopilot(
         self, header: Header, name: str, packet: bytes, arrival_ns: int
     ) -> list[TelemetrySample]:
-        message = self._unpacked(packet)
+        message = self._unpack(packet)
         if name == "HEARTBEAT":
             self._autopilot = message.autopilot
             self.armed = bool(message.base_mode & self._dialect.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -111,7 +111,7 @@ class MavlinkDecoder(PacketDecoder):
             self.counters.unheard += self._senders.unheard(header, name)
             return []
         source = self.source(f"{header.system}.{header.component}/{name}")
-        return samples.of(self._unpacked(packet), MessageTime(arrival_ns, arrival_ns, source))
+        return samples.of(self._unpack(packet), MessageTime(arrival_ns, arrival_ns, source))
 
     def outgoing(self, now_ns: int) -> bytes:
         """The bytes to write now: answers to TIMESYNC, and once a second our own request."""
@@ -123,7 +123,7 @@ class MavlinkDecoder(PacketDecoder):
             self._sent += 1
             receiver = self._receiver(outbound)
             for message in messages_of(self._dialect, outbound, receiver, self._sent):
-                data += self._packed(message)
+                data += self._pack(message)
         if self._talk_at_ns is not None and now_ns < self._talk_at_ns:
             return data
         self._talk_at_ns = now_ns + TALK_EVERY_NS
@@ -137,7 +137,7 @@ class MavlinkDecoder(PacketDecoder):
             mavlink_version=3,
         )
         request = self._dialect.MAVLink_timesync_message(tc1=0, ts1=now_ns)
-        return data + self._packed(heartbeat) + self._packed(request)
+        return data + self._pack(heartbeat) + self._pack(request)
 
     def send(self, outbound: OutboundMessage) -> bool:
         """Queue ``outbound`` for the next write; False where we only listen. For any thread."""
@@ -152,20 +152,20 @@ class MavlinkDecoder(PacketDecoder):
             return Receiver(None, self._autopilot)
         return Receiver(max(outbound.t_ns - report.offset_ns, 0), self._autopilot)
 
-    def _unpacked(self, packet: bytes) -> Any:
+    def _unpack(self, packet: bytes) -> Any:
         try:
             return self._wire.decode(bytearray(packet))
         except self._dialect.MAVError as error:
             raise ValueError(str(error)) from error
 
-    def _packed(self, message: Any) -> bytes:
+    def _pack(self, message: Any) -> bytes:
         data = bytes(message.pack(self._wire))
         self._wire.seq = (self._wire.seq + 1) % 256
         return data
 
     def _answer(self, message: Any | None) -> None:
         if message is not None and len(self._outgoing) < MAX_OUTGOING_BYTES:
-            self._outgoing += self._packed(message)
+            self._outgoing += self._pack(message)
 
     def _synchronise(self, message: Any, arrival_ns: int) -> None:
         """mavlink.io/en/services/timesync.html: tc1 is 0 in requests, ts1 is the asker's clock."""
@@ -217,7 +217,7 @@ class MavlinkCommands:
         self._answered: tuple[Header, int, int] | None = None
         """Who sent the last command, which one, and its result."""
 
-    def acknowledged(self, header: Header, message: Any) -> Any | None:
+    def acknowledge(self, header: Header, message: Any) -> Any | None:
         """The COMMAND_ACK of a COMMAND_LONG or COMMAND_INT; None if it is none of ours."""
         if self.asked is None or (message.target_system, message.target_component) != self._us:
             return None

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.fixes import Fixes, sigma_of
-from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
+from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalise, rotate
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -108,7 +108,7 @@ class MavlinkSamples:
         )
 
     def _quaternion(self, message: Any, stamp: MessageTime) -> Samples:
-        q = normalised((message.q1, message.q2, message.q3, message.q4))
+        q = normalise((message.q1, message.q2, message.q3, message.q4))
         return self._orientation(q, message, stamp)
 
     def _orientation(self, q: Quaternion, message: Any, stamp: MessageTime) -> Samples:
@@ -140,7 +140,7 @@ class MavlinkSamples:
         sigma_m = message.h_acc / 1000.0 or sigma_of(hdop)
         found = self._fixes.fix(*stamp, message.lat * DEGREES, message.lon * DEGREES, sigma_m)
         if message.time_usec > SINCE_1970_US:
-            t_ns = self._fixes.dated(stamp.t_ns)
+            t_ns = self._fixes.date(stamp.t_ns)
             found.append(UtcTime(t_ns, *stamp[1:], 1000 * message.time_usec))
         return found
 

@@ -152,7 +152,7 @@ class Nmea2000Decoder(PacketDecoder):
         source = self.source(str(FIX))
         days, clock = _value("H", data, 1), _value("I", data, 3)
         utc_ns = days * DAY_NS + clock * CLOCK_NS
-        found: list[TelemetrySample] = [UtcTime(self._fixes.dated(t_ns), t_ns, source, utc_ns)]
+        found: list[TelemetrySample] = [UtcTime(self._fixes.date(t_ns), t_ns, source, utc_ns)]
         if self._position_ns is not None and t_ns - self._position_ns <= POSITION_LIFE_NS:
             return found
         lat, lon = (_value("q", data, at) * FINE_PLACE_DEG for at in (7, 15))

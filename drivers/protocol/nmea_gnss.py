@@ -52,7 +52,7 @@ class NmeaGnss:
             return []
         day, month, year = (int(fields[8][at : at + 2]) for at in (0, 2, 4))
         utc_ns = _utc_ns(CENTURY + year, month, day, fields[0])
-        found: Samples = [UtcTime(self._fixes.dated(t_ns), t_ns, source, utc_ns)]
+        found: Samples = [UtcTime(self._fixes.date(t_ns), t_ns, source, utc_ns)]
         if self._gga_ns is None or t_ns - self._gga_ns > GGA_LIFE_NS:
             found += self._fix(fields[2:6], t_ns, source, None)
         return found

@@ -129,7 +129,7 @@ class NucleusDecoder(PacketDecoder):
         data = packet[HEADER.size :]
         _, begin, _, seconds, microseconds, status = COMMON.unpack_from(data)
         t_ns = self.clock.stamp(seconds * 10**9 + microseconds * 1000, arrival_ns)
-        values = partial(_unpacked, data, begin)
+        values = partial(_unpack, data, begin)
         return convert(data, values, status, NucleusTime(t_ns, arrival_ns, self.source(name)))
 
     def outgoing(self, now_ns: int) -> bytes:
@@ -193,5 +193,5 @@ def checksum(data: bytes) -> int:
     return (SEED + int(sum(words)) + odd) & 0xFFFF
 
 
-def _unpacked(data: bytes, begin: int, code: str, at: int) -> tuple[float, ...]:
+def _unpack(data: bytes, begin: int, code: str, at: int) -> tuple[float, ...]:
     return struct.unpack_from(code, data, begin + at)

@@ -73,7 +73,7 @@ def from_beams(
         ValueError: more than one beam is bad.
     """
     angle = head.beam_angle(known_deg)
-    one, two, three, four = _completed(beams)
+    one, two, three, four = _complete(beams)
     a, b = 1.0 / (2.0 * math.sin(angle)), 1.0 / (4.0 * math.cos(angle))
     c = 1.0 if head.configuration & CONVEX else -1.0
     error = (one + two - three - four) * a / math.sqrt(2.0)
@@ -106,7 +106,7 @@ def from_earth(velocity: Vector, head: Pd0Head, leader: bytes) -> Vector:
     return right, forward, -down
 
 
-def _completed(beams: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+def _complete(beams: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
     """With a bad one replaced by what makes the error velocity 0."""
     bad = [k for k, value in enumerate(beams) if value == BAD_VELOCITY]
     if not bad:

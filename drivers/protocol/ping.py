@@ -76,11 +76,11 @@ class PingDecoder(PacketDecoder):
         number = int(HEADER.unpack_from(packet)[2])
         payload = packet[HEADER.size : -CHECKSUM]
         if number == NACK:
-            self._refused(payload)
+            self._log_refusal(payload)
             return []
         if number not in NAMES:
             return []
-        self._answered(arrival_ns)
+        self._record_answer(arrival_ns)
         if number == DISTANCE_SIMPLE:
             distance_mm, confidence = SIMPLE.unpack_from(payload)
         else:
@@ -113,11 +113,11 @@ class PingDecoder(PacketDecoder):
     def _interval_ns(self) -> int:
         return round(self._config.interval_s * 1e9)
 
-    def _answered(self, now_ns: int) -> None:
+    def _record_answer(self, now_ns: int) -> None:
         streams = self._config.ask_for == "stream"
         self._ask_at_ns = now_ns + STREAM_NS if streams else self._asked_ns + self._interval_ns
 
-    def _refused(self, payload: bytes) -> None:
+    def _log_refusal(self, payload: bytes) -> None:
         """NACK: the message that was refused, and why."""
         (refused,) = struct.unpack_from("<H", payload)
         self.counters.invalid_values += 1

@@ -23,7 +23,7 @@ from aquaflow.drivers.protocol.vectornav_frames import (
     fields_of,
     line_of,
 )
-from aquaflow.drivers.rotation import from_euler, normalised
+from aquaflow.drivers.rotation import from_euler, normalise
 from aquaflow.types import Acceleration, AngularRate, Attitude, TelemetrySample, UtcTime
 
 STARTUP = (Field(1, 0), Field(2, 0))
@@ -69,7 +69,7 @@ class VectorNavDecoder(PacketDecoder):
             "VNGYR": lambda said, at, source: [AngularRate(at, at, source, _vector(said[:3]))],
             "VNIMU": lambda said, at, source: _motion([], said[3:9], at, source),
             "VNISL": lambda said, at, source: _motion(said[:3], said[9:15], at, source),
-            "VNINS": self._filtered,
+            "VNINS": self._read_filter,
         }
 
     def decode(self, packet: bytes, arrival_ns: int) -> Samples:
@@ -104,7 +104,7 @@ class VectorNavDecoder(PacketDecoder):
         sigma_m = stated or sigma_of(None)
         return self._fixes.fix(t_ns, arrival_ns, source, latitude, longitude, sigma_m)
 
-    def _filtered(self, said: list[str], t_ns: int, source: str) -> Samples:
+    def _read_filter(self, said: list[str], t_ns: int, source: str) -> Samples:
         """VNINS: seconds, week, status; yaw, pitch, roll; latitude, longitude, height; velocity;
         sigmas of attitude, position, velocity."""
         samples = _angles(_numbers(said[3:6]), t_ns, source)
@@ -144,7 +144,7 @@ def _utc(fields: Fields, t_ns: int, arrival_ns: int, source: str) -> Samples:
 
 def _quaternion(xyzw: Numbers, t_ns: int, arrival_ns: int, source: str) -> Samples:
     x, y, z, w = xyzw
-    return [Attitude(t_ns, arrival_ns, source, normalised((w, x, y, z)))]
+    return [Attitude(t_ns, arrival_ns, source, normalise((w, x, y, z)))]
 
 
 def _angles(degrees: Numbers, t_ns: int, source: str) -> Samples:

@@ -20,7 +20,7 @@ class Ages:
         self._max_ns = None if config.max_age_s is None else round(config.max_age_s * 1e9)
         self._clock = StreamClock(f"stream '{name}'") if has_stream_time(config.url) else None
 
-    def judged(self, stream_ns: int, arrival_ns: int) -> tuple[int, str]:
+    def judge(self, stream_ns: int, arrival_ns: int) -> tuple[int, str]:
         """When a picture was taken, and why it is too old; empty: it is not.
 
         ``stream_ns`` is the stream's own time, of no meaning where it carries none.

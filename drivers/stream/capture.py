@@ -15,7 +15,7 @@ from aquaflow.drivers.ffmpeg import rgb_of
 from aquaflow.drivers.jpeg import jpeg_to_rgb
 from aquaflow.drivers.stream.address import for_logs, is_at_a_port
 from aquaflow.drivers.stream.ages import Ages
-from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, opened
+from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, open_capture
 from aquaflow.types import CameraModel, EncodedPicture
 
 MOTION_JPEG = "MJPG"
@@ -43,7 +43,7 @@ class StreamCapture:
         self._stale = ""
         self._damaged = 0
         self._grabbed = False
-        self._capture = opened(source, config)
+        self._capture = open_capture(source, config)
         if not self._capture.isOpened() or not self._has_size():
             self.close()
             raise ConnectionError(f"no video from {for_logs(config.url)}{_advice(config)}")
@@ -60,8 +60,8 @@ class StreamCapture:
             self._damaged -= 1
             return RawPicture(arrival_ns, rgb_of(None), stale=self._stale)
         self._grabbed = False
-        exposed_ns, self._stale = self._ages.judged(self._stream_ns(), arrival_ns)
-        shown = None if self._stale else self._retrieved()
+        exposed_ns, self._stale = self._ages.judge(self._stream_ns(), arrival_ns)
+        shown = None if self._stale else self._retrieve()
         if shown is None or not self._sends_jpeg:
             return RawPicture(arrival_ns, rgb_of(shown), exposed_ns, stale=self._stale)
         jpeg = shown.reshape(-1)
@@ -99,7 +99,7 @@ class StreamCapture:
 
         return round(1e6 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
 
-    def _retrieved(self) -> npt.NDArray[np.uint8] | None:
+    def _retrieve(self) -> npt.NDArray[np.uint8] | None:
         """[H, W, 3] BGR, or the bytes of a JPEG file; must be fetched before the next picture is
         grabbed, used or not."""
         decoded, bgr = self._capture.retrieve()

@@ -61,11 +61,11 @@ class Depacketizer:
             return []
         if self._picture is not None and ticks != self._ticks:
             self._picture.is_whole = False
-            done.append(self._finished())
+            done.append(self._finish())
         self._begin(ticks, arrival_ns)
         self._unpack(payload)
         if packet[1] & 0x80:
-            done.append(self._finished())
+            done.append(self._finish())
         return [picture for picture in done if picture.units]
 
     def _payload(self, packet: bytes) -> bytes | None:
@@ -99,7 +99,7 @@ class Depacketizer:
             self._picture = ReceivedPicture(stream_ns, arrival_ns, is_whole=not self._gap)
         self._gap = False
 
-    def _finished(self) -> ReceivedPicture:
+    def _finish(self) -> ReceivedPicture:
         assert self._picture is not None
         picture, self._picture = self._picture, None
         picture.is_whole &= not self._fragments
@@ -112,7 +112,7 @@ class Depacketizer:
         if 0 < kind <= LARGEST_WHOLE:
             self._picture.units.append(payload)
         elif kind == AGGREGATE:
-            self._picture.units += _aggregated(payload)
+            self._picture.units += _aggregate(payload)
         elif kind == FRAGMENT and len(payload) > 2:
             self._join(payload)
         else:
@@ -132,7 +132,7 @@ class Depacketizer:
             self._fragments.clear()
 
 
-def _aggregated(payload: bytes) -> Units:
+def _aggregate(payload: bytes) -> Units:
     units, at = [], 1
     while at + 2 < len(payload):
         (size,) = struct.unpack_from(">H", payload, at)

@@ -32,7 +32,7 @@ LOW_DELAY = {
 """FFmpeg's options: analyzeduration in us, probesize in bytes (20 Mbit/s for ANALYSE_S)."""
 
 
-def opened(source: str, config: StreamConfig) -> Any:
+def open_capture(source: str, config: StreamConfig) -> Any:
     """A ``cv2.VideoCapture`` on ``source``; that may not be open, or know no size."""
     import cv2
 

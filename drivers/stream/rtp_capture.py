@@ -15,7 +15,7 @@ from aquaflow.drivers.h264 import (
     SEQUENCE_PARAMETERS,
     TYPE_BITS,
     Units,
-    decoded,
+    decode,
 )
 from aquaflow.drivers.stream.ages import Ages
 from aquaflow.drivers.stream.depacketizer import Depacketizer, ReceivedPicture
@@ -47,7 +47,7 @@ class RtpCapture:
         self.format = f"H264 in RTP on UDP port {session.port.number}"
         self._depacketizer = Depacketizer(session.payload_type(first))
         self._ages = Ages(name, config)
-        self._pictures = decoded(self._received(first))
+        self._pictures = decode(self._receive_pictures(first))
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; waits up to the configured stall time for its packets.
@@ -57,7 +57,7 @@ class RtpCapture:
             ConnectionError: packets come, but no picture.
         """
         picture, bgr = next(self._pictures)
-        exposed_ns, stale = self._ages.judged(picture.stream_ns, picture.arrival_ns)
+        exposed_ns, stale = self._ages.judge(picture.stream_ns, picture.arrival_ns)
         shown = rgb_of(bgr) if picture.is_whole else rgb_of(None, LOST)
         return RawPicture(time.monotonic_ns(), shown, exposed_ns=exposed_ns, stale=stale)
 
@@ -65,7 +65,7 @@ class RtpCapture:
         self._pictures.close()
         self._receiver.close()
 
-    def _received(self, first: bytes) -> Iterator[tuple[ReceivedPicture, Units]]:
+    def _receive_pictures(self, first: bytes) -> Iterator[tuple[ReceivedPicture, Units]]:
         """Pictures from the first on that can be decoded."""
         deadline_s, packet, has_begun = time.monotonic() + OPEN_TIMEOUT_S, first, False
         while True:

@@ -94,7 +94,7 @@ def session_of(config: StreamConfig) -> Session:
         FileNotFoundError: there is no such SDP file.
     """
     if is_session(config.url):
-        return _described(_text(config.url), config.codec)
+        return _describe(_text(config.url), config.codec)
     parts = urlsplit(config.url)
     expected = None if config.payload_type is None else (config.payload_type,)
     return Session(Port(parts.hostname or "", parts.port or 0), expected, {}, config.codec)
@@ -109,7 +109,7 @@ def _text(url: str) -> str:
         raise FileNotFoundError(f"cannot read the session description {url}: {error}") from error
 
 
-def _described(text: str, codec: str) -> Session:
+def _describe(text: str, codec: str) -> Session:
     media, address = MEDIA.search(text), ADDRESS.search(text)
     if media is None:
         raise ConnectionError("the session description (SDP) holds no line 'm=video PORT RTP/AVP'")

@@ -44,7 +44,7 @@ class CanLink:
                 wait_s = 0.0 if records else max(deadline - time.monotonic(), 0.0)
                 message = self._bus.recv(wait_s)
                 if message is not None:
-                    records += packed(message)
+                    records += pack(message)
                 elif records or time.monotonic() >= deadline:
                     break
         except (self._error, OSError, ValueError) as error:
@@ -73,7 +73,7 @@ class CanLink:
             self._bus.shutdown()
 
 
-def packed(message: Message) -> list[bytes]:
+def pack(message: Message) -> list[bytes]:
     """The record of a data frame; none of an error, remote or CAN FD frame."""
     if message.is_error_frame or message.is_remote_frame or message.is_fd:
         return []

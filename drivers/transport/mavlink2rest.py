@@ -68,16 +68,16 @@ class RestClient:
     def ask(self, method: str, path: str, body: str | None = None) -> tuple[int, str]:
         """Status and text of the answer; raises LinkLostError where nobody answers."""
         try:
-            return self._asked(method, path, body)
+            return self._request(method, path, body)
         except (OSError, http.client.HTTPException):
             self.close()  # a service closes connections that were idle for seconds
         try:
-            return self._asked(method, path, body)
+            return self._request(method, path, body)
         except (OSError, http.client.HTTPException) as error:
             self.close()
             raise LinkLostError(f"mavlink2rest at {self._host} is lost: {error}") from error
 
-    def _asked(self, method: str, path: str, body: str | None) -> tuple[int, str]:
+    def _request(self, method: str, path: str, body: str | None) -> tuple[int, str]:
         headers = {"Content-Type": "application/json"}
         self._connection.request(method, self.path + path, body, headers)
         answer = self._connection.getresponse()
@@ -92,7 +92,7 @@ class RestClient:
             report = report_of(self.dialect, message, template)
             status, answer = self.ask("POST", "/v1/mavlink", json.dumps(report))
             if status != http.HTTPStatus.OK:
-                self._refused(message.get_type(), answer)
+                self._log_refusal(message.get_type(), answer)
 
     def close(self) -> None:
         self._connection.close()
@@ -104,11 +104,11 @@ class RestClient:
             try:
                 self._templates[name] = dict(json.loads(answer)["message"])
             except MALFORMED:
-                self._refused(name, answer if status != http.HTTPStatus.OK else "no template")
+                self._log_refusal(name, answer if status != http.HTTPStatus.OK else "no template")
                 return None
         return self._templates[name]
 
-    def _refused(self, name: str, answer: str) -> None:
+    def _log_refusal(self, name: str, answer: str) -> None:
         if not self._said_refused:
             self._said_refused = True
             words = " ".join(answer.split())[:160]
@@ -265,7 +265,7 @@ def report_of(dialect: Any, message: Any, template: Report) -> dict[str, Any]:
         key = "mavtype" if name == "type" else name
         if key in template:
             names = dialect.enums.get(message.fieldenums_by_name.get(name), {})
-            body[key] = _written(getattr(message, name), template[key], names)
+            body[key] = _write_value(getattr(message, name), template[key], names)
     header = message.get_header()
     sender = {"system_id": header.srcSystem, "component_id": header.srcComponent}
     return {"header": {**sender, "sequence": header.seq}, "message": body}
@@ -287,13 +287,13 @@ def _binary(dialect: Any, value: Any, kind: str) -> Any:
     return value
 
 
-def _written(value: Any, form: Any, names: Mapping[int, Any]) -> Any:
+def _write_value(value: Any, form: Any, names: Mapping[int, Any]) -> Any:
     """A field's value in the form of ``form``; ``names`` are those of its enumeration."""
     if isinstance(form, list):
         if isinstance(value, str | bytes):
             text = value if isinstance(value, str) else value.decode("ascii", "replace")
             return list(text.ljust(len(form), "\0"))
-        return [_written(each, 0, names) for each in value]
+        return [_write_value(each, 0, names) for each in value]
     if isinstance(form, dict):
         return {"bits": value} if "bits" in form else {"type": names[value].name}
     if isinstance(form, str):

@@ -10,10 +10,10 @@ from pathlib import Path
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.drivers.capture import RawPicture, no_file, nothing_to_release
 from aquaflow.drivers.ffmpeg import rgb_of
-from aquaflow.drivers.h264 import Units, decoded, units_of
+from aquaflow.drivers.h264 import Units, decode, units_of
 from aquaflow.drivers.live import LiveCamera
 from aquaflow.drivers.v4l2.capture import V4l2Capture
-from aquaflow.drivers.v4l2.discovery import explained, find_camera
+from aquaflow.drivers.v4l2.discovery import explain_error, find_camera
 from aquaflow.drivers.v4l2.pixels import STREAMED
 from aquaflow.drivers.v4l2.system import Kernel, KernelInterface
 from aquaflow.types import CameraModel
@@ -44,7 +44,7 @@ class V4l2Camera(LiveCamera):
         try:
             capture = V4l2Capture(self._system, str(node.path), self._v4l2)
         except OSError as error:
-            raise explained(error, node.path) from error
+            raise explain_error(error, node.path) from error
         if capture.settled.pixels != STREAMED:
             return capture
         return StreamedCapture(capture, self._v4l2.stall_s)
@@ -65,7 +65,7 @@ class StreamedCapture:
     def __init__(self, device: V4l2Capture, stall_s: float) -> None:
         self.notes, self.format = device.notes, device.format
         self._device, self._stall_s = device, stall_s
-        self._pictures = decoded(self._received())
+        self._pictures = decode(self._receive_pictures())
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; waits up to the configured stall time for it.
@@ -80,7 +80,7 @@ class StreamedCapture:
         self._pictures.close()
         self._device.close()
 
-    def _received(self) -> Iterator[tuple[RawPicture, Units]]:
+    def _receive_pictures(self) -> Iterator[tuple[RawPicture, Units]]:
         """What the device sends, in memory of its own."""
         heard_s = time.monotonic()
         while True:

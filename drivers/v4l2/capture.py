@@ -20,7 +20,7 @@ from aquaflow.drivers.v4l2 import abi
 from aquaflow.drivers.v4l2.discovery import capabilities
 from aquaflow.drivers.v4l2.pixels import JPEG_PIXELS, STREAMED, to_rgb
 from aquaflow.drivers.v4l2.planes import BufferLayout, SinglePlanar, layout_of
-from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
+from aquaflow.drivers.v4l2.system import KernelInterface, call, supports
 from aquaflow.types import CameraModel, EncodedPicture
 
 
@@ -49,7 +49,7 @@ class V4l2Capture:
         self._open = True
         try:
             self._layout = layout_of(capabilities(system, self._fd))
-            self.settled = self._layout.settled(system, self._fd, config)
+            self.settled = self._layout.negotiate_format(system, self._fd, config)
             fps, rate_notes = self._set_rate(config)
             controls = apply_controls(system, self._fd, config)
             self._maps = [self._map(index) for index in range(self._request(config.buffers))]
@@ -96,7 +96,7 @@ class V4l2Capture:
         starts = buffer.flags & abi.BUF_FLAG_TSTAMP_SRC_MASK == abi.BUF_FLAG_TSTAMP_SRC_SOE
         if not starts and self._exposure_s is not None:
             stamp_ns -= round(self._exposure_s * 1e9)
-        used = self._layout.used(buffer)
+        used = self._layout.picture_slices(buffer)
         data = [place[part] for place, part in zip(self._maps[buffer.index], used, strict=True)]
         return RawPicture(
             arrival_ns=self._now_ns(),
@@ -143,7 +143,7 @@ class V4l2Capture:
         """Ask; the rate that it is, and for people, where it is another."""
         rate = abi.StreamParameters(type=self._layout.kind)
         rate.timeperframe = abi.Fraction(1000, round(config.fps * 1000))
-        if not supported(self._system, self._fd, abi.S_PARM, rate):
+        if not supports(self._system, self._fd, abi.S_PARM, rate):
             return config.fps, ()
         period = rate.timeperframe
         got = period.denominator / max(1, period.numerator)
@@ -197,7 +197,7 @@ def apply_controls(system: KernelInterface, fd: int, config: V4l2Config) -> Fixe
 
     def fix(what: str, automatic: tuple[int, int], control: int, wanted: int) -> int | None:
         # A camera without the automatic may still have the value, so its absence says nothing.
-        supported(system, fd, abi.S_CTRL, abi.V4l2Control(*automatic))
+        supports(system, fd, abi.S_CTRL, abi.V4l2Control(*automatic))
         value = _set(system, fd, control, wanted)
         if value is None:
             notes.append(f"the camera has no fixed {what}; it decides for itself")
@@ -227,10 +227,10 @@ def apply_controls(system: KernelInterface, fd: int, config: V4l2Config) -> Fixe
 def _set(system: KernelInterface, fd: int, control: int, wanted: int) -> int | None:
     """Set within the camera's range; what it then has, None if it has no such control."""
     limits = abi.QueryControl(id=control)
-    if not supported(system, fd, abi.QUERYCTRL, limits):
+    if not supports(system, fd, abi.QUERYCTRL, limits):
         return None
     setting = abi.V4l2Control(control, max(limits.minimum, min(limits.maximum, wanted)))
-    if not supported(system, fd, abi.S_CTRL, setting):
+    if not supports(system, fd, abi.S_CTRL, setting):
         return None
     call(system, fd, abi.G_CTRL, setting)
     return int(setting.value)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from aquaflow.drivers.v4l2 import abi, abi_planes
 from aquaflow.drivers.v4l2.planes import layout_of
-from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
+from aquaflow.drivers.v4l2.system import KernelInterface, call, supports
 
 TAKES_PICTURES = abi.CAP_VIDEO_CAPTURE | abi_planes.CAP_VIDEO_CAPTURE_MPLANE
 """In one piece or in several; codecs, which turn pictures into pictures, say otherwise."""
@@ -67,7 +67,7 @@ def modes(system: KernelInterface, path: Path) -> list[str]:
     try:
         formats = []
         form = abi.FormatDescription(type=layout_of(capabilities(system, fd)).kind)
-        while supported(system, fd, abi.ENUM_FMT, form):
+        while supports(system, fd, abi.ENUM_FMT, form):
             name = abi.name_of(form.pixelformat)
             size = _largest(system, fd, form.pixelformat)
             formats.append(f"{name} up to {size[0]} x {size[1]}" if size else name)
@@ -80,7 +80,7 @@ def modes(system: KernelInterface, path: Path) -> list[str]:
 def _largest(system: KernelInterface, fd: int, pixelformat: int) -> tuple[int, int] | None:
     sizes = []
     size = abi.FrameSize(pixelformat=pixelformat)
-    while supported(system, fd, abi.ENUM_FRAMESIZES, size):
+    while supports(system, fd, abi.ENUM_FRAMESIZES, size):
         if size.type != abi.FRMSIZE_DISCRETE:
             # min width, max width, step, min height, max height, step
             return size.height, size.stepwise[2]
@@ -147,7 +147,7 @@ def _number(path: Path) -> int:
     return int(digits) if digits else 0
 
 
-def explained(error: OSError, path: Path) -> OSError:
+def explain_error(error: OSError, path: Path) -> OSError:
     """The same error with a sentence that says what to do."""
     advice = {
         errno.EBUSY: "another program has it; on BlueOS, the camera manager: use its stream",

@@ -33,7 +33,9 @@ class BufferLayout(Protocol):
     kind: int
     """V4L2_BUF_TYPE_*."""
 
-    def settled(self, system: KernelInterface, fd: int, config: V4l2Config) -> PictureFormat:
+    def negotiate_format(
+        self, system: KernelInterface, fd: int, config: V4l2Config
+    ) -> PictureFormat:
         """Ask for a format, and take what the driver makes of it."""
         ...
 
@@ -45,7 +47,7 @@ class BufferLayout(Protocol):
         """Length and offset of each piece of memory."""
         ...
 
-    def used(self, buffer: abi.Buffer) -> list[slice]:
+    def picture_slices(self, buffer: abi.Buffer) -> list[slice]:
         """Of each piece, the bytes that are of the picture."""
         ...
 
@@ -61,7 +63,9 @@ class SinglePlanar:
 
     kind = abi.VIDEO_CAPTURE
 
-    def settled(self, system: KernelInterface, fd: int, config: V4l2Config) -> PictureFormat:
+    def negotiate_format(
+        self, system: KernelInterface, fd: int, config: V4l2Config
+    ) -> PictureFormat:
         wanted = abi.Format(type=self.kind)
         pix = wanted.fmt.pix
         pix.width, pix.height = config.width, config.height
@@ -76,7 +80,7 @@ class SinglePlanar:
     def places(self, buffer: abi.Buffer) -> list[tuple[int, int]]:
         return [(int(buffer.length), buffer.offset & 0xFFFFFFFF)]
 
-    def used(self, buffer: abi.Buffer) -> list[slice]:
+    def picture_slices(self, buffer: abi.Buffer) -> list[slice]:
         return [slice(0, int(buffer.bytesused))]
 
 
@@ -88,7 +92,9 @@ class MultiPlanar:
     def __init__(self) -> None:
         self._count = 1
 
-    def settled(self, system: KernelInterface, fd: int, config: V4l2Config) -> PictureFormat:
+    def negotiate_format(
+        self, system: KernelInterface, fd: int, config: V4l2Config
+    ) -> PictureFormat:
         wanted = abi.Format(type=self.kind)
         pix = abi_planes.PixFormatMplane.from_buffer(wanted.fmt.raw)
         pix.width, pix.height = config.width, config.height
@@ -110,5 +116,5 @@ class MultiPlanar:
     def places(self, buffer: abi.Buffer) -> list[tuple[int, int]]:
         return [(int(plane.length), plane.offset & 0xFFFFFFFF) for plane in buffer.planes]
 
-    def used(self, buffer: abi.Buffer) -> list[slice]:
+    def picture_slices(self, buffer: abi.Buffer) -> list[slice]:
         return [slice(int(plane.data_offset), int(plane.bytesused)) for plane in buffer.planes]

@@ -71,7 +71,7 @@ def call(system: KernelInterface, fd: int, request: int, argument: Argument) -> 
             continue
 
 
-def supported(system: KernelInterface, fd: int, request: int, argument: Argument) -> bool:
+def supports(system: KernelInterface, fd: int, request: int, argument: Argument) -> bool:
     """An ioctl that a driver may lack; False if it does.
 
     Raises:

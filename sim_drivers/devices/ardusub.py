@@ -80,13 +80,13 @@ class ArduSub:
             case Attitude():
                 self._R_nb = Rotation.from_quat(np.roll(sample.wxyz, -1))
                 yaw, pitch, roll = self._R_nb.as_euler("ZYX")
-                packets = [self._packed("attitude", boot_ms, roll, pitch, yaw, *self._rate)]
+                packets = [self._pack("attitude", boot_ms, roll, pitch, yaw, *self._rate)]
             case Depth():
                 packets = self._pressure(sample.depth_m, boot_ms)
             case Velocity():
                 vx, vy, vz = self._R_nb.apply(sample.velocity_m_s)
                 local = (0.0, 0.0, self._depth_m, vx, vy, vz)
-                packets = [self._packed("local_position_ned", boot_ms, *local)]
+                packets = [self._pack("local_position_ned", boot_ms, *local)]
             case Altitude():
                 packets = [self._range(sample.altitude_m, boot_ms)]
             case Lights():
@@ -94,7 +94,7 @@ class ArduSub:
             case Position():
                 packets = [self._fix(sample, measured_ns // 1000)]
             case UtcTime():
-                packets = [self._packed("system_time", sample.utc_ns // 1000, boot_ms)]
+                packets = [self._pack("system_time", sample.utc_ns // 1000, boot_ms)]
         return packets
 
     def answer(self, packet: bytes, now_ns: int) -> list[bytes]:
@@ -108,7 +108,7 @@ class ArduSub:
             if kind == "STATUSTEXT":
                 self.texts.append(message.text)
             if kind == "TIMESYNC" and message.tc1 == 0:
-                answers.append(self._packed("timesync", now_ns, message.ts1))
+                answers.append(self._pack("timesync", now_ns, message.ts1))
             elif kind == "TIMESYNC":
                 self.answers += 1
         return answers
@@ -121,7 +121,7 @@ class ArduSub:
         )
         self._commands.append(bytes(command.pack(station)))
 
-    def unprompted(self, now_ns: int) -> list[bytes]:
+    def due_packets(self, now_ns: int) -> list[bytes]:
         routed, self._commands = self._commands, []
         if self._beat_ns is not None and now_ns < self._beat_ns:
             return routed
@@ -131,12 +131,12 @@ class ArduSub:
         mode = 81 | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)
         return [
             *routed,
-            self._packed("heartbeat", submarine, autopilot, mode, 19, dialect.MAV_STATE_ACTIVE, 3),
-            self._packed("system_time", 0, now_ns // 1_000_000),
-            self._packed("timesync", 0, now_ns),
+            self._pack("heartbeat", submarine, autopilot, mode, 19, dialect.MAV_STATE_ACTIVE, 3),
+            self._pack("system_time", 0, now_ns // 1_000_000),
+            self._pack("timesync", 0, now_ns),
         ]
 
-    def _packed(self, message: str, *fields: float) -> bytes:
+    def _pack(self, message: str, *fields: float) -> bytes:
         return self._packed_by(self._wire, message, *fields)
 
     def _packed_by(self, wire: Any, message: str, *fields: float) -> bytes:
@@ -148,14 +148,14 @@ class ArduSub:
     def _imu(self, time_us: int) -> bytes:
         milli_g = [_int16(value / GRAVITY_M_S2 * 1000) for value in self._force]
         milli_rad = [_int16(value * 1000) for value in self._rate]
-        return self._packed("raw_imu", time_us, *milli_g, *milli_rad, 0, 0, 0)
+        return self._pack("raw_imu", time_us, *milli_g, *milli_rad, 0, 0, 0)
 
     def _pressure(self, depth_m: float, boot_ms: int) -> list[bytes]:
         self._depth_m = depth_m
-        hull = self._packed("scaled_pressure", boot_ms, 1009.5, 0.0, 3243)
+        hull = self._pack("scaled_pressure", boot_ms, 1009.5, 0.0, 3243)
         water_hpa = SURFACE_HPA + depth_m * SALT_WATER_KG_M3 * GRAVITY_M_S2 / 100
-        water = self._packed("scaled_pressure2", boot_ms, water_hpa, 0.0, 1256)
-        return [hull, water, self._packed("vfr_hud", 0.0, 0.0, 0, 0, -depth_m, 0.0)]
+        water = self._pack("scaled_pressure2", boot_ms, water_hpa, 0.0, 1256)
+        return [hull, water, self._pack("vfr_hud", 0.0, 0.0, 0, 0, -depth_m, 0.0)]
 
     def _range(self, altitude_m: float, boot_ms: int) -> bytes:
         down = self._dialect.MAV_SENSOR_ROTATION_PITCH_270
@@ -168,13 +168,13 @@ class ArduSub:
         place = round(sample.latitude_deg * 1e7), round(sample.longitude_deg * 1e7)
         eph, unknown, satellites = 160, 0xFFFF, 21
         accuracy_mm = 0 if self._mavlink_1 else round(1000 * sample.sigma_m)
-        return self._packed(
+        return self._pack(
             "gps_raw_int", time_us, 3, *place, 0, eph, unknown, 0, 0, satellites, 0, accuracy_mm
         )
 
     def _servos(self, pulse_us: int, time_us: int) -> bytes:
         thrusters = [1500] * 8
-        return self._packed("servo_output_raw", time_us % 2**32, 0, *thrusters, pulse_us, *[0] * 7)
+        return self._pack("servo_output_raw", time_us % 2**32, 0, *thrusters, pulse_us, *[0] * 7)
 
 
 def _int16(value: float) -> int:

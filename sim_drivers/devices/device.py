@@ -32,7 +32,7 @@ class DeviceProtocol(Protocol[Packet]):
         """Answers to what came in."""
         ...
 
-    def unprompted(self, now_ns: int) -> list[Packet]:
+    def due_packets(self, now_ns: int) -> list[Packet]:
         """Packets that are due now without a request, such as heartbeats."""
         ...
 
@@ -118,21 +118,21 @@ class SimulatedDevice(Generic[Packet]):
             return
         while not self._stopping.is_set():
             self._exchange()
-            left_s = (elapsed_ns - self._elapsed()) / self._speed * 1e-9
+            left_s = (elapsed_ns - self._now_in_log_ns()) / self._speed * 1e-9
             if left_s <= 0:
                 return
             self._stopping.wait(min(left_s, POLL_S))
 
-    def _elapsed(self) -> int:
+    def _now_in_log_ns(self) -> int:
         if self._speed is None:
             return self._elapsed_ns
         return round((time.monotonic_ns() - self._started_ns) * self._speed)
 
     def _now_ns(self) -> int:
-        return self._clock(self._elapsed())
+        return self._clock(self._now_in_log_ns())
 
     def _exchange(self) -> None:
-        self._send(self._protocol.unprompted(self._now_ns()))
+        self._send(self._protocol.due_packets(self._now_ns()))
         while (packet := self._wire.receive()) is not None:
             self._send(self._protocol.answer(packet, self._now_ns()))
 
@@ -148,5 +148,5 @@ class OneWayDevice(Generic[Packet]):
     def answer(self, packet: Packet, now_ns: int) -> list[Packet]:
         return []
 
-    def unprompted(self, now_ns: int) -> list[Packet]:
+    def due_packets(self, now_ns: int) -> list[Packet]:
         return []

@@ -111,7 +111,7 @@ class Mavlink2restWire:
         with self._changing:
             self._clients.pop(client, None)
 
-    def stored(self, path: str) -> dict[str, Any] | None:
+    def last_message(self, path: str) -> dict[str, Any] | None:
         """The last message below ``path`` with its count."""
         found = self._stored.get(path)
         if found is None:
@@ -150,7 +150,7 @@ class Mavlink2restWire:
         made = message(**{name: b"" if kind == "char" else empty[name] for name, kind in kinds})
         return {"header": {"system_id": 255}, "message": self.body(made)}
 
-    def posted(self, text: str) -> bool:
+    def post(self, text: str) -> bool:
         """Send a report on to the autopilot; False if a field is missing or wrong."""
         try:
             report = json.loads(text)
@@ -198,12 +198,12 @@ class _Handler(BaseHTTPRequestHandler):
             template = json.dumps(self.wire.template(name)) if known else ""
             self._answer(200 if known else 404, template or "Invalid message name.")
         else:
-            stored = self.wire.stored(path.removeprefix("/v1/mavlink/"))
+            stored = self.wire.last_message(path.removeprefix("/v1/mavlink/"))
             self._answer(200, "None" if stored is None else json.dumps(stored, indent=2))
 
     def do_POST(self) -> None:
         text = self.rfile.read(int(self.headers["Content-Length"])).decode()
-        if self.wire.posted(text):
+        if self.wire.post(text):
             self._answer(200, "Ok.")
         else:
             self._answer(404, "Failed to parse message, not a valid MAVLinkMessage.")

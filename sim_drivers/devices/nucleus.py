@@ -46,15 +46,15 @@ class Nucleus:
 
     def answer(self, packet: bytes, now_ns: int) -> list[bytes]:
         *lines, self._heard = (self._heard + packet).split(b"\r\n")
-        return [answer for line in lines for answer in self._answered(line)]
+        return [answer for line in lines for answer in self._answer(line)]
 
-    def unprompted(self, now_ns: int) -> list[bytes]:
+    def due_packets(self, now_ns: int) -> list[bytes]:
         if self.password is None or (self._asked_ns and now_ns - self._asked_ns < ASK_NS):
             return []
         self._asked_ns = now_ns
         return [PROMPT]
 
-    def _answered(self, line: bytes) -> list[bytes]:
+    def _answer(self, line: bytes) -> list[bytes]:
         self.commands.append(line)
         if self.password is not None:
             if line != self.password.encode():
@@ -110,11 +110,11 @@ def packet(
     begin = 16 + len(fixed)
     seconds, rest = divmod(us, 1_000_000)
     data = struct.pack("<BBBBIII", version, begin, 0, 0, seconds, rest, status) + fixed + values
-    header = struct.pack("<BBBBHH", 0xA5, 10, number, 0x20, len(data), summed(data))
-    return header + struct.pack("<H", summed(header)) + data
+    header = struct.pack("<BBBBHH", 0xA5, 10, number, 0x20, len(data), sum_words(data))
+    return header + struct.pack("<H", sum_words(header)) + data
 
 
-def summed(data: bytes) -> int:
+def sum_words(data: bytes) -> int:
     """Nortek's checksum: words added to 0xB58C, an odd byte as the upper half of a word."""
     total = 0xB58C
     for at in range(0, len(data) - 1, 2):

@@ -47,10 +47,14 @@ class Pd0Dvl(OneWayDevice[bytes]):
                 self._R_nb = Rotation.from_quat(np.roll(sample.wxyz, -1))
             case Velocity():
                 self._ensemble += 1
-                return [ensemble(self._fixed(), self._variable(measured_ns), self._bottom(sample))]
+                return [
+                    ensemble(
+                        self._fixed_leader(), self._variable(measured_ns), self._bottom(sample)
+                    )
+                ]
         return []
 
-    def _fixed(self) -> bytes:
+    def _fixed_leader(self) -> bytes:
         leader = bytearray(FIXED_BYTES)
         struct.pack_into("<H", leader, 4, CONFIGURATION)
         leader[25] = COORDINATES[self._coordinates]
@@ -74,12 +78,14 @@ class Pd0Dvl(OneWayDevice[bytes]):
         centimetres = round(self._altitude_m * 100)
         struct.pack_into("<H", track, 0, 0x0600)
         struct.pack_into("<4H", track, 16, *[centimetres & 0xFFFF] * 4)
-        told = (round(1000.0 * value) for value in self._told(np.array(sample.velocity_m_s)))
+        told = (
+            round(1000.0 * value) for value in self._beam_velocities(np.array(sample.velocity_m_s))
+        )
         struct.pack_into("<4h", track, 24, *told)
         track[77:81] = bytes([centimetres >> 16] * 4)
         return bytes(track)
 
-    def _told(
+    def _beam_velocities(
         self,
         velocity: npt.NDArray[np.float64],  # [3] m/s, forward, right, down, of the vehicle
     ) -> tuple[float, ...]:

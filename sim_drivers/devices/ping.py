@@ -30,7 +30,7 @@ class Ping1D:
             return []
         self._altitude_m = sample.altitude_m
         self._measured += 1
-        return [self._said(1300)] if self.streams else []
+        return [self._message(1300)] if self.streams else []
 
     def answer(self, packet: bytes, now_ns: int) -> list[bytes]:
         """Requests come one by one: the other side waits for the answer."""
@@ -42,12 +42,12 @@ class Ping1D:
             return [] if self.streams else [frame(2, struct.pack("<H", number) + b"no such stream")]
         assert number == 6
         self.requests += 1
-        return [self._said(about)]
+        return [self._message(about)]
 
-    def unprompted(self, now_ns: int) -> list[bytes]:
+    def due_packets(self, now_ns: int) -> list[bytes]:
         return []
 
-    def _said(self, number: int) -> bytes:
+    def _message(self, number: int) -> bytes:
         millimetres = round(1000 * self._altitude_m)
         if number == 1211:
             return frame(number, struct.pack("<IB", millimetres, self.confidence))

@@ -69,8 +69,8 @@ class VectorNav(OneWayDevice[bytes]):
                 self._angles = f"{yaw:+09.4f},{pitch:+09.4f},{roll:+09.4f}"
                 bodies = [f"VNYPR,{self._angles}"]
             case AngularRate():
-                force, rate = (_said(each) for each in (self._force, sample.rate_rad_s))
-                magnetic = _said((1.0, 0.1, 0.5))
+                force, rate = (_sentence(each) for each in (self._force, sample.rate_rad_s))
+                magnetic = _sentence((1.0, 0.1, 0.5))
                 bodies = [f"VNIMU,{magnetic},{force},{rate},+21.5,+101.325"]
             case Position():
                 place = f"{sample.latitude_deg:+013.9f},{sample.longitude_deg:+014.9f}"
@@ -88,7 +88,7 @@ def _utc(sample: UtcTime) -> bytes:
     return struct.pack("<b5BH", *date, rest_ns // 10**6)
 
 
-def _said(values: tuple[float, ...]) -> str:
+def _sentence(values: tuple[float, ...]) -> str:
     return ",".join(f"{value:+010.6f}" for value in values)
 
 

@@ -123,7 +123,7 @@ class TcpWire:
             self._client = None
 
     def send(self, packet: bytes) -> None:
-        client = self._accepted()
+        client = self._accept()
         if client is not None:
             try:
                 client.sendall(packet)
@@ -131,7 +131,7 @@ class TcpWire:
                 self.unplug()
 
     def receive(self) -> bytes | None:
-        client = self._accepted()
+        client = self._accept()
         if client is None:
             return None
         try:
@@ -148,7 +148,7 @@ class TcpWire:
         self.unplug()
         self._server.close()
 
-    def _accepted(self) -> socket.socket | None:
+    def _accept(self) -> socket.socket | None:
         if self._client is None:
             with contextlib.suppress(OSError):
                 client, _ = self._server.accept()

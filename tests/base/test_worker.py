@@ -46,7 +46,7 @@ def fail() -> str:
 
 
 def found(worker: Worker, wait: bool = False) -> list[str]:
-    return [each.found for each in worker.finished(wait)]
+    return [each.found for each in worker.take_finished(wait)]
 
 
 def test_in_step_the_result_is_there_at_once_and_once_only() -> None:

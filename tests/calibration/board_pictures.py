@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
-from aquaflow.calibration.board import Board, drawn
+from aquaflow.calibration.board import Board, draw
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import rays_of_pixels
 
@@ -39,7 +39,7 @@ def taken(
     camera: CameraModel, board: Board, R: Array, t: Array, noise: float = 2.0, seed: int = 0
 ) -> Image:
     """[H, W, 3] the board in front of grey water."""
-    print_ = drawn(board, SQUARE_PX).astype(np.float32)
+    print_ = draw(board, SQUARE_PX).astype(np.float32)
     # Where rays meet the board is smooth: it is computed at every few pixels.
     u, v = (np.linspace(0.0, side, side // KNOT_PX + 1) for side in (camera.width, camera.height))
     origins, rays = rays_of_pixels(camera, np.stack(np.meshgrid(u, v), -1).reshape(-1, 2))

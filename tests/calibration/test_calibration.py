@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.calibration.board import Board, BoardKind, Detector, drawn, write_board
+from aquaflow.calibration.board import Board, BoardKind, Detector, draw, write_board
 from aquaflow.calibration.calibrate import calibrate, write_calibration
 from aquaflow.calibration.views import LEAST_VIEWS
 from aquaflow.geometry.camera import CameraModel, load_camera
@@ -121,7 +121,7 @@ def test_a_port_is_estimated_only_where_there_is_a_flat_one(through_glass: Path)
 @pytest.mark.parametrize("kind", ["charuco", "apriltag"])
 def test_a_printed_board_is_found_whole_and_straight(kind: BoardKind) -> None:
     board = Board(kind, 7, 5, 0.03)
-    found = Detector(board)(drawn(board, 80))
+    found = Detector(board)(draw(board, 80))
     corners = {"charuco": 6 * 4, "apriltag": 7 * 5 * 4}[kind]
     assert len(found.numbers) == corners
     expected = found.points_m[:, :2] / board.square_m * 80.0 + 40.0

@@ -11,19 +11,22 @@ import pytest
 import yaml
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.config import Config, load_config, parse_config
-from aquaflow.config.old_keys import CONSTANTS, GONE
+from aquaflow.config import Config, MappingConfig, load_config
+from aquaflow.config.old_keys import CONSTANTS, GONE, without_old_keys
 from aquaflow.config.presets import PRESETS, configured
 from aquaflow.config.service import ServiceConfig
-from aquaflow.config.stage import Stage, stages_of
+from aquaflow.config.stage import StageConfig, stages_of, validated
 from aquaflow.config.vehicle import VehicleConfig, load_any, load_vehicle
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.state import deserialise, serialise
+from aquaflow.render.reference import ReferenceRenderer
 from tests.command_line import Cli
 
 MOST_PUBLIC = 90
 """Keys that a user decides about a dive and its service; equipment is described apart."""
 
 
-def public_keys(model: type[Stage], prefix: str = "") -> Iterator[str]:
+def public_keys(model: type[StageConfig], prefix: str = "") -> Iterator[str]:
     for name, _, below, is_lab in stages_of(model):
         if not is_lab:
             yield from [prefix + name] if below is None else public_keys(below, f"{prefix}{name}.")
@@ -109,7 +112,8 @@ def test_a_setting_that_is_a_constant_now_is_taken_out_and_its_value_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, path: str
 ) -> None:
     caplog.set_level(logging.WARNING)
-    assert parse_config(nested(path, CONSTANTS[path]), "here") == Config()
+    same = without_old_keys(nested(path, CONSTANTS[path]), "here")
+    assert validated(VehicleConfig, same, "here") == VehicleConfig()
     assert caplog.records == []
     load_any(written(tmp_path, yaml.safe_dump(nested(path, -7))))
     (record,) = caplog.records
@@ -123,6 +127,20 @@ def test_a_key_whose_code_went_is_taken_out_and_the_reason_told(
     load_any(written(tmp_path, yaml.safe_dump(nested(path, True))))
     (record,) = caplog.records
     assert f"'{path}' is no key any more and not used: {GONE[path]}" in record.message
+
+
+def test_a_map_written_with_keys_of_before_is_read(caplog: pytest.LogCaptureFixture) -> None:
+    facts, arrays = serialise(Mapper(MappingConfig(), ReferenceRenderer(), 0))
+    old = {path: value for path, value in CONSTANTS.items() if path.startswith("mapping.")}
+    old |= dict.fromkeys(GONE, False)
+    for path, value in old.items():
+        *stages, key = path.split(".")[1:]
+        below = facts["config"]
+        for stage in stages:
+            below = below[stage]
+        below[key] = value
+    assert deserialise(facts, arrays, ReferenceRenderer()).config == MappingConfig()
+    assert caplog.records == []
 
 
 def test_no_key_of_before_is_a_key_of_today_and_no_preset_sets_one() -> None:

@@ -1,7 +1,7 @@
 """The whole ci suite on the pretended device, on the CPU, and on the CPU without compiled kernels.
 
 ``python -m tests.device.suite FOLDER`` maps every scene and prints the table of
-docs/measurements.md#pretended-device. On the device and on the CPU without compiled kernels the
+notes/measurements.md#pretended-device. On the device and on the CPU without compiled kernels the
 same operations are made in the same order; the compiled ones round otherwise, and a map's
 optimisation makes of that what a change of the number of threads makes too.
 """

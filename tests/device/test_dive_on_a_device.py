@@ -19,7 +19,7 @@ from aquaflow.dive.map_file import read_map_file
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.restored import export_restored
 from aquaflow.lab.bench.scene import BenchmarkScene
-from aquaflow.lab.bench.worker import measured
+from aquaflow.lab.bench.worker import measure_errors
 from aquaflow.render.contract import CPU
 from aquaflow.survey.measure.scale_bar import between_pixels
 from tests.device.device_scenes import WHERE, counted
@@ -120,7 +120,7 @@ def test_the_dive_has_all_that_a_map_can_have(dives: Dives, device: Device) -> N
 
 def test_its_errors_are_the_same(dives: Dives) -> None:
     scene = BenchmarkScene("small", str(dives.recording), str(dives.recording))
-    on_cpu, away = (measured(scene, folder) for folder in dives.folders)
+    on_cpu, away = (measure_errors(scene, folder) for folder in dives.folders)
     for key in ("ate_pct_sim3", "depth_absrel"):
         assert away[key] == pytest.approx(on_cpu[key], rel=10.0 * NEAR)
 

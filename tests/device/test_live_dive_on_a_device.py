@@ -14,7 +14,7 @@ import pytest
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.live.checkpoint.generations import read_state, state_file
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
@@ -62,7 +62,7 @@ def frames(device: Device, tmp_path_factory: pytest.TempPathFactory) -> list[Fra
 def live(folder: Path) -> Iterator[LiveDive]:
     """A dive in ``folder``, the one that was cut off there if there is one."""
     with machine_with(PRETENDED):
-        dive = LiveDive("live", resumed(folder, new=False), ToldFeed(), VEHICLE)
+        dive = LiveDive("live", resume_folder(folder, new=False), ToldFeed(), VEHICLE)
         try:
             assert dive.parts.maps.renderer.device == PRETENDED
             yield dive

@@ -12,7 +12,7 @@ from aquaflow.config.service import LiveMappingConfig
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.live.map_thread import MapThread
-from aquaflow.mapping.map_copy import MapCopy, copied
+from aquaflow.mapping.map_copy import MapCopy, copy_map
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
@@ -58,7 +58,7 @@ def looked_at(thread: MapThread) -> MapCopy:
     done = threading.Event()
 
     def look(maps: Maps) -> None:
-        copies.append(copied(maps.mappers[0]))
+        copies.append(copy_map(maps.mappers[0]))
         done.set()
 
     thread._post("look", look)

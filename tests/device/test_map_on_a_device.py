@@ -11,11 +11,11 @@ import torch
 from aquaflow.api.map import Map
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.mapping import state
-from aquaflow.mapping.map_copy import copied
+from aquaflow.mapping.map_copy import copy_map
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.cpu import CpuRenderer
-from aquaflow.survey.viewer.live_viewer import shown
+from aquaflow.survey.viewer.live_viewer import pack_for_browser
 from tests.device.device_scenes import (
     SMALL,
     WHERE,
@@ -141,7 +141,7 @@ def test_at_the_hard_cap_gaussians_are_recycled_as_on_the_cpu(
 
 
 def test_viewers_get_the_same_from_a_device(twins: tuple[Mapper, Mapper]) -> None:
-    (wanted, *_), (got, *_) = (shown(copied(mapper), 50) for mapper in twins)
+    (wanted, *_), (got, *_) = (pack_for_browser(copy_map(mapper), 50) for mapper in twins)
     np.testing.assert_allclose(got.centres, wanted.centres, rtol=1e-5)
     np.testing.assert_allclose(got.colours, wanted.colours, atol=1e-4)
     assert set(got.levels) == {"seen", "range"}

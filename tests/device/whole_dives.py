@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from aquaflow.config import Config
-from aquaflow.config.presets import merged
+from aquaflow.config.presets import merge
 from aquaflow.dive.replay import map_recording
 from aquaflow.dive.run import Finished
 from aquaflow.lab.bench.altered import dim_light
@@ -28,7 +28,7 @@ FEW_STEPS: dict[str, Any] = {
         "heldout_steps": 3,
     },
 }  # fmt: skip
-SETTINGS: dict[str, Any] = {"threads": 1, "mapping": merged(ALL_PARTS, FEW_STEPS)}
+SETTINGS: dict[str, Any] = {"threads": 1, "mapping": merge(ALL_PARTS, FEW_STEPS)}
 """Everything that a map can have, in few steps."""
 
 

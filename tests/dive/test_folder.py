@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.dive_status import DiveState, read_status, unfinished
+from aquaflow.base.storage.dive_status import DiveState, read_status, unfinished_reason
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
@@ -180,11 +180,11 @@ def test_a_folder_is_open_before_anything_in_it_is_touched_and_finished_when_tha
 ) -> None:
     dive, unlink = tmp_path / "dive", Path.unlink
     with opened(dive) as folder:
-        assert "is being written" in (unfinished(dive) or "")
+        assert "is being written" in (unfinished_reason(dive) or "")
         (dive / "map.ply").touch()
         (dive / "metrics.json").write_text("{}")
         folder.set_finished()
-    assert unfinished(dive) is None
+    assert unfinished_reason(dive) is None
     states = []
 
     def seen(self: Path, missing_ok: bool = False) -> None:
@@ -197,7 +197,7 @@ def test_a_folder_is_open_before_anything_in_it_is_touched_and_finished_when_tha
     with opened(dive, overwrite=True):
         pass
     assert states == [DiveState.OPEN]
-    assert "mapping it was cut off, or failed" in (unfinished(dive) or "")
+    assert "mapping it was cut off, or failed" in (unfinished_reason(dive) or "")
 
 
 def test_a_folder_that_was_cut_off_before_its_table_can_be_mapped_into_again(

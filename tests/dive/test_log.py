@@ -79,8 +79,8 @@ def test_what_differs_in_more_than_its_numbers_is_written_whole() -> None:
         assert repeats.admit({"n": 1}, "the disk is full") == {"n": 1}
     assert repeats.admit({"n": 2}, "the disk is full") is None
     assert repeats.admit({"n": 3}, "the disk is slow") == {"n": 3}
-    assert repeats.held() == [{"n": 2}]
-    assert repeats.held() == []
+    assert repeats.held_entries() == [{"n": 2}]
+    assert repeats.held_entries() == []
 
 
 def test_kinds_that_were_not_met_for_long_are_forgotten() -> None:

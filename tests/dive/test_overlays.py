@@ -92,7 +92,7 @@ def keypoints_of_the_lens(
         return masked
 
     find = OverlayFinder.masked
-    monkeypatch.setattr(OverlayFinder, "masked", keep)
+    monkeypatch.setattr(OverlayFinder, "mask", keep)
     monkeypatch.setattr(calibration_pass, "found_lens", spy)
     recording = open_recording(pool / "images")
     calibration_pass.found_in(recording, config, lambda done, of: None)
@@ -124,7 +124,7 @@ def test_a_finder_that_fails_costs_no_frame(monkeypatch: pytest.MonkeyPatch) -> 
     def fail(frame: Frame) -> Frame:
         raise ValueError("no overlay")
 
-    monkeypatch.setattr(slam.overlays, "masked", fail)
+    monkeypatch.setattr(slam.overlays, "mask", fail)
     tracked = [each for k in range(2) for each in slam.process(frame_of(k))]
     slam.close()
     assert [each.frame.index for each in tracked] == [0, 1]

@@ -41,7 +41,7 @@ def test_keyframes_lie_where_the_trajectory_says(small_recording: Path, tmp_path
         T_nc = frames[place.sub_map].pose(place.T_mc)
         nearest = path[np.abs(path[:, 0] - 1e-9 * place.t_ns).argmin()]
         assert np.allclose(T_nc.t, nearest[1:4], atol=1e-6)
-        assert file.keypoints(place.number).known(0.15).sum() > 100
+        assert file.keypoints(place.number).is_known(0.15).sum() > 100
     joined = set(file.edges["a"]) | set(file.edges["b"])
     assert joined == {place.number for place in file.places}
 

@@ -141,7 +141,7 @@ def test_transformed_gaussians_have_the_transformed_covariances():
     before = splats(3)
     T = Sim3(Rotation.from_rotvec([0.3, 2.0, -0.7]).as_matrix(), np.array([1.0, -2.0, 30.0]), 2.5)
 
-    after = before.transformed(T)
+    after = before.transform(T)
 
     np.testing.assert_allclose(after.means, 2.5 * before.means @ T.R.T + T.t, atol=1e-12)
     np.testing.assert_allclose(

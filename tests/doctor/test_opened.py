@@ -11,7 +11,7 @@ import yaml
 
 from aquaflow.config.vehicle import load_any, load_vehicle
 from aquaflow.doctor import MachineProbes
-from aquaflow.doctor.opened import opened
+from aquaflow.doctor.opened import check_opened
 from tests.command_line import Cli, refused
 
 SHIPPED = sorted((Path(__file__).parents[2] / "deploy" / "config").glob("*.yaml"))
@@ -68,7 +68,7 @@ def findings(tmp_path: Path, written: dict[str, object]) -> dict[str, tuple[str,
     file = tmp_path / "vehicle.yaml"
     file.write_text(yaml.safe_dump(written))
     machine = MachineProbes(root=tmp_path)
-    return {each.name: (each.found, each.ok) for each in opened(load_any(file), machine)}
+    return {each.name: (each.found, each.ok) for each in check_opened(load_any(file), machine)}
 
 
 def test_files_and_folders_that_are_not_there_are_said(tmp_path: Path) -> None:
@@ -131,4 +131,4 @@ def test_a_password_of_a_stream_is_not_shown(tmp_path: Path) -> None:
     file = tmp_path / "vehicle.yaml"
     url = "rtsp://user:hidden@host:554/a"
     file.write_text(yaml.safe_dump({"cameras": {"front": {"kind": "stream", "url": url}}}))
-    assert not any("hidden" in str(each) for each in opened(load_any(file)))
+    assert not any("hidden" in str(each) for each in check_opened(load_any(file)))

@@ -15,7 +15,7 @@ import pytest
 
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak import dai_backend
-from aquaflow.drivers.oak.dai_backend import DaiBackend, chosen
+from aquaflow.drivers.oak.dai_backend import DaiBackend, choose
 from aquaflow.drivers.oak.messages import imu_readings, picture_of
 
 
@@ -103,7 +103,7 @@ def test_pictures_are_encoded_as_the_link_demands(
     speed: str, settings: dict[str, object], encoding: str
 ) -> None:
     config = OakConfig.model_validate({"kind": "oak", **settings})
-    assert chosen(config, speed) == encoding
+    assert choose(config, speed) == encoding
 
 
 def test_a_slow_link_gets_jpeg_from_the_device_and_the_log_says_so(

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from aquaflow.drivers.h264 import Units, decoded, units_of
+from aquaflow.drivers.h264 import Units, decode, units_of
 from aquaflow.sim_drivers.h264_writer import access_unit
 from aquaflow.sim_drivers.h264_writer import units as written
 
@@ -41,7 +41,7 @@ def shown(sent: Iterator[tuple[str, Units]]) -> list[tuple[str, int | None]]:
     """Each label with the number that its picture tells; at the end comes the end."""
     found = []
     with suppress(ConnectionError):
-        for label, bgr in decoded(sent):
+        for label, bgr in decode(sent):
             found.append((label, None if bgr is None else round(float(bgr.mean()) / 5.0)))
     return found
 
@@ -52,7 +52,7 @@ def expected(missing: set[int]) -> list[tuple[str, int | None]]:
 
 def test_each_picture_is_there_before_the_next_is_taken() -> None:
     sent = Sent()
-    pictures = decoded(iter(sent))
+    pictures = decode(iter(sent))
     for number in range(COUNT):
         label, bgr = next(pictures)
         assert label == f"picture {number}"
@@ -80,7 +80,7 @@ def test_what_the_camera_raises_is_raised_after_its_last_picture() -> None:
             yield number, written(image(number), number)
         raise TimeoutError("no picture for 3 s")
 
-    pictures = decoded(failing())
+    pictures = decode(failing())
     assert [next(pictures)[0] for _ in range(3)] == [0, 1, 2]
     with pytest.raises(TimeoutError, match="no picture for 3 s"):
         next(pictures)

@@ -209,7 +209,7 @@ def test_a_service_that_refuses_is_named_once(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wire = Mavlink2restWire()
-    monkeypatch.setattr(wire, "posted", lambda text: False)
+    monkeypatch.setattr(wire, "post", lambda text: False)
     with caplog.at_level(logging.WARNING):
         telemetry = served(wire, "ws")
         until(lambda: "does not send" in caplog.text)
@@ -280,7 +280,7 @@ def test_another_service_at_the_address_is_lost_in_words(
     scheme: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wire = Mavlink2restWire()
-    monkeypatch.setattr(wire, "stored", lambda path: 1 / 0)
+    monkeypatch.setattr(wire, "last_message", lambda path: 1 / 0)
     url = f"{scheme}://127.0.0.1:{wire.port}" + ("/elsewhere" if scheme == "ws" else "")
     config = MavlinkConfig.model_validate(settings(link={"kind": "mavlink2rest", "url": url}))
     with pytest.raises(LinkLostError, match="mavlink2rest"):

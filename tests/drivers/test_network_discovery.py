@@ -305,7 +305,7 @@ def test_without_hosts_the_network_is_left_alone(
 
 @pytest.mark.parametrize("host", ["", "no such host", "a" * 300, "\u00fc\u0000", "[::1", "-"])
 def test_what_is_no_host_is_nowhere(host: str, tmp_path: Path) -> None:
-    assert conversation.said((host, NOBODY)) == b""
+    assert conversation.ask_server((host, NOBODY)) == b""
     assert conversation.json_of((host, NOBODY), "/streams") is None
 
 
@@ -314,5 +314,5 @@ def test_a_server_that_never_ends_is_not_listened_to_for_ever(
 ) -> None:
     monkeypatch.setattr(conversation, "MOST_BYTES", 1000)
     with tcp_server(lambda heard: b"", greeting=b"x" * 1_000_000) as port:
-        heard = conversation.said((HOST, port), enough=lambda data: False)
+        heard = conversation.ask_server((HOST, port), enough=lambda data: False)
     assert 1000 <= len(heard) <= 1000 + conversation.DATAGRAM

@@ -21,7 +21,7 @@ from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.protocol.nucleus import PATIENCE_NS, NucleusDecoder, checksum
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
-from aquaflow.sim_drivers.devices.nucleus import Nucleus, packet, summed
+from aquaflow.sim_drivers.devices.nucleus import Nucleus, packet, sum_words
 from aquaflow.sim_drivers.devices.wires import TcpWire
 from aquaflow.types import Acceleration, Altitude, AngularRate, Attitude, Depth, Velocity
 from tests.drivers.simulated_links import endless, motion, until
@@ -130,7 +130,7 @@ def test_the_checksum_is_the_documented_one() -> None:
     draw = random.Random(5)
     for _ in range(300):
         data = draw.randbytes(draw.randrange(40))
-        assert checksum(data) == summed(data)
+        assert checksum(data) == sum_words(data)
 
 
 def test_packets_that_are_not_asked_for_are_counted_only() -> None:

@@ -8,7 +8,7 @@ from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.protocol.nmea_sentence import framing
 from aquaflow.drivers.protocol.packets import PacketReader
 from aquaflow.drivers.telemetry import decoder_of
-from aquaflow.drivers.transport.can import packed
+from aquaflow.drivers.transport.can import pack
 from aquaflow.sim_drivers.devices.nmea_talker import sentence
 from tests.drivers.simulated_links import RIGS, STEPS, motion, telemetry_config
 
@@ -23,7 +23,7 @@ def reader() -> PacketReader:
 def stream_of(rig) -> bytes:
     """All that the device says of a motion, as the driver's link delivers it."""
     said = [packet for sample in motion() for packet in rig.protocol.encode(sample, 10**9, 10**9)]
-    return b"".join(p if isinstance(p, bytes) else b"".join(packed(p)) for p in said)
+    return b"".join(p if isinstance(p, bytes) else b"".join(pack(p)) for p in said)
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)

@@ -16,7 +16,7 @@ from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.plausible import plausible
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.telemetry import decoder_of
-from aquaflow.drivers.transport.can import EXTENDED, RECORD, packed
+from aquaflow.drivers.transport.can import EXTENDED, RECORD, pack
 from aquaflow.sim_drivers.devices.nmea_talker import sentence
 from aquaflow.sim_drivers.devices.nucleus import packet as framed
 from aquaflow.sim_drivers.devices.pd0 import ensemble
@@ -190,7 +190,7 @@ def parser_and_packets(name: str, folder: Path) -> tuple[PacketDecoder, list[byt
     rig = RIGS[name](folder)
     rig.wire.close()
     said = [packet for s in motion(10) for packet in rig.protocol.encode(s, 10**9, 10**9)]
-    packets = [packed(p)[0] if isinstance(p, can.Message) else p for p in said]
+    packets = [pack(p)[0] if isinstance(p, can.Message) else p for p in said]
     return decoder_of("device", telemetry_config(rig).devices["device"]), packets
 
 

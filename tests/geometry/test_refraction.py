@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aquaflow.geometry.port import DomePort, FlatPort, Port
-from aquaflow.geometry.refraction import rays_in_water, rays_to_points, refracted
+from aquaflow.geometry.refraction import rays_in_water, rays_to_points, refract
 
 Array = npt.NDArray[np.float64]
 
@@ -135,8 +135,8 @@ def test_without_indexes_the_camera_is_a_pinhole(port: Port) -> None:
 
 def test_total_reflection_gives_no_ray() -> None:
     normal = np.array([0.0, 0.0, 1.0])
-    assert np.isnan(refracted(towards(70.0), normal, 1.34)).all()
-    assert np.isfinite(refracted(towards(40.0), normal, 1.34)).all()
+    assert np.isnan(refract(towards(70.0), normal, 1.34)).all()
+    assert np.isfinite(refract(towards(40.0), normal, 1.34)).all()
 
 
 @EVERY_PORT

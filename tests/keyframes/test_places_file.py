@@ -17,8 +17,8 @@ from aquaflow.keyframes.place import (
     LEVELS,
     KeyframePlace,
     KeypointDepths,
-    packed,
-    unpacked,
+    pack,
+    unpack,
 )
 from aquaflow.keyframes.places_file import EDGE, NAME, PlacesFile, Rows, write_places
 from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE
@@ -77,12 +77,12 @@ def test_an_edge_to_a_keyframe_that_was_left_out_is_left_out(written: Path) -> N
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60))
 def test_what_is_rounded_stays_within_what_is_stated(seed: int, count: int) -> None:
     before = seen(seed, count)
-    after = unpacked(packed(before), CAMERA)
+    after = unpack(pack(before), CAMERA)
     apart = np.abs(after.keypoints.pixels - before.keypoints.pixels)
     assert (apart <= 160 / 2**16 + 1e-5).all()
     assert np.allclose(after.rho, before.rho, rtol=1e-6)
-    assert np.array_equal(after.known(0.06), before.known(0.06))
-    assert not after.known(0.04).any()
+    assert np.array_equal(after.is_known(0.06), before.is_known(0.06))
+    assert not after.is_known(0.04).any()
     root = np.sqrt(before.keypoints.descriptors)
     root /= np.maximum(np.linalg.norm(root, axis=1, keepdims=True), 1e-12)
     off = np.abs(np.sqrt(after.keypoints.descriptors) - np.minimum(root, LARGEST_ROOT))
@@ -167,4 +167,4 @@ def test_descriptors_that_the_format_cannot_hold_are_not_kept() -> None:
     before = seen(0)
     wrong = Keypoints(before.keypoints.pixels, -before.keypoints.descriptors - 1.0)
     with pytest.raises(ValueError, match="negative"):
-        packed(KeypointDepths(CAMERA, wrong, before.rho, before.variance))
+        pack(KeypointDepths(CAMERA, wrong, before.rho, before.variance))

@@ -24,7 +24,7 @@ from aquaflow.live.checkpoint.generations import STATE, Checkpoint
 from aquaflow.live.checkpoint.resume import newest_usable
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.onboard import OnboardSettings, begun
+from aquaflow.live.onboard import OnboardSettings, begin_dive
 from aquaflow.sources import open_recording
 from aquaflow.sources.newest import Newest
 from aquaflow.types import Dropped, Frame
@@ -74,7 +74,7 @@ def gone_on_with(folder: Path, frames: list[Frame], new: bool = False) -> tuple[
     """Resume, take the frames, and be told to stop, which keeps what it can be resumed from; and
     True if it was the dive of before."""
     feed = ListedFeed(frames)
-    with begun(feed, VEHICLE, OnboardSettings(folder, new)) as dive:
+    with begin_dive(feed, VEHICLE, OnboardSettings(folder, new)) as dive:
         feed.listed.at_end = partial(_stop, dive)
         finished = dive.run()
     assert finished is not None
@@ -93,7 +93,7 @@ def killed_dive(folder: Path) -> list[Frame]:
     frames = frames_of(folder / "recording")
     gone_on_with(folder / "running", frames[:STOPPED])
     feed = ListedFeed([])
-    with begun(feed, VEHICLE, OnboardSettings(folder / "running")) as dive:
+    with begin_dive(feed, VEHICLE, OnboardSettings(folder / "running")) as dive:
         for count, frame in enumerate(frames[STOPPED:KILLED], start=STOPPED + 1):
             dive.parts.loop.take(frame)
             if count in (FIRST, SECOND):

@@ -62,7 +62,7 @@ def every_picture(at: int | None, happen: Callable[[], None], files: list[Path])
             for file in [*files, *files]:  # what is written at first may be of long before
                 wait_for_newer(file, time.time())
             happen()
-        while not self.asked(1.0):
+        while not self.wait_for_consumer(1.0):
             pass
         put(self, frame)
 

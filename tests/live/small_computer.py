@@ -22,7 +22,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.lab.bench.growth.worker import folder_bytes
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
 from aquaflow.lab.synthetic.survey import FPS, SurveyPictures
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.feed import LiveFeed
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import LiveLoop
@@ -95,7 +95,7 @@ def dive(seconds: float, folder: Path, width: int, gaussians: int, mapping: bool
     recorder = Recorder(folder / "recording", config.recording)
     camera = SurveyCamera(width, int(seconds * FPS))
     feed = LiveFeed(CAMERA, {CAMERA: camera}, None, config.source, recorder)
-    choice = resumed(folder / "dive", new=True)
+    choice = resume_folder(folder / "dive", new=True)
     with LiveDive("small computer", choice, feed, config, True) as live:
         live.parts.loop.watchers.append(Watcher(live).update)
         live.run()

@@ -25,7 +25,7 @@ import numpy as np
 from aquaflow.config.service import ListenConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.lab.synthetic import SyntheticConfig, write_dive
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.feed import ASK_S, _Pumps
 from aquaflow.live.health.client import ask
 from aquaflow.live.health.http import HealthServer
@@ -81,7 +81,7 @@ class Rounds(_Pumps):
 
     def _swim(self) -> None:
         for frame in itertools.islice(self.pictures(), self._count):
-            while not self.newest.asked(ASK_S):
+            while not self.newest.wait_for_consumer(ASK_S):
                 if self.closing.is_set():
                     return
             self.newest.put(replace(frame, arrival_ns=time.monotonic_ns()))
@@ -177,7 +177,7 @@ def soak(frames: int, folder: Path, vehicle: VehicleConfig = VEHICLE) -> list[Sa
     if not recording.exists():
         write_dive(recording, ROUND)
     feed = Rounds(recording, frames)
-    with LiveDive("soak", resumed(folder / "dive", new=True), feed, vehicle, True) as dive:
+    with LiveDive("soak", resume_folder(folder / "dive", new=True), feed, vehicle, True) as dive:
         server = HealthServer(ListenConfig(port=_free_port()), lambda: report(dive.parts, 1e6))
         try:
             url = f"http://127.0.0.1:{server.port}"

@@ -24,7 +24,7 @@ from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.stress.one_place import OnePlace
 from aquaflow.lab.stress.swim import CAMERA
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.feed import _Pumps
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.live_dive import LiveDive
@@ -147,7 +147,7 @@ def soak(
     settings = VEHICLE.model_dump()
     settings["mapping"]["enabled"] = mapping
     vehicle = VehicleConfig.model_validate(settings)
-    choice = resumed(folder / "dive", new=True)
+    choice = resume_folder(folder / "dive", new=True)
     with LiveDive("soak", choice, AtOnePlace(place, frames), vehicle, True) as dive:
         observer = Observer(dive, place, frames, folder / "soak.csv")
         dive.parts.loop.watchers.append(observer.update)

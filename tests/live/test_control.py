@@ -58,16 +58,16 @@ def test_a_dive_ends_when_it_is_finished_or_the_service_stops() -> None:
 def test_after_a_finished_dive_the_service_is_idle_and_after_new_it_begins_another() -> None:
     control = at(DivePhase.MAPPING)
     control.ask(ServiceRequest.FINISH)
-    control.ended()
+    control.end_dive()
     assert control.phase is DivePhase.IDLE
     control.ask(ServiceRequest.START)
     assert not control.begin()  # what can be gone on with is
     control.ask(ServiceRequest.NEW)
-    control.ended()
+    control.end_dive()
     assert control.phase is DivePhase.MAPPING
     assert control.begin()
     control.ask(ServiceRequest.FINISH)
-    control.ended()
+    control.end_dive()
     assert control.phase is DivePhase.IDLE
 
 
@@ -75,7 +75,7 @@ def test_a_new_dive_that_cannot_be_begun_is_not_tried_for_ever() -> None:
     control = ServiceControl()
     control.ask(ServiceRequest.NEW)
     assert control.begin()
-    control.ended()
+    control.end_dive()
     assert control.phase is DivePhase.IDLE
 
 

@@ -28,7 +28,7 @@ from aquaflow.dive.log import EarlyRecords
 from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.v4l2 import V4l2Camera
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.feed import LiveFeed
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.live_dive import LiveDive
@@ -157,7 +157,7 @@ def told(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Tol
     autopilot = SimulatedDevice(ArduSub(), wire, samples).start()
     feed = LiveFeed("front", {"front": camera}, links, SourceConfig())
     told = Told()
-    with LiveDive("sea", resumed(root / "dive", new=False), feed, VEHICLE) as dive:
+    with LiveDive("sea", resume_folder(root / "dive", new=False), feed, VEHICLE) as dive:
         told.dive = dive
         fate = Fate(dive, camera, kernel, wire, told)
         fate.start()

@@ -101,7 +101,7 @@ def test_a_new_dive_counts_from_its_first_frame_with_the_samples_before_it(tmp_p
     feed = LiveFeed("front", {"front": front}, None, SourceConfig())
     feed.continue_from(Continued())
     feed.latest_samples.take(early)
-    assert feed.latest_samples.taken() == []  # nothing says yet where the dive begins
+    assert feed.latest_samples.take_new() == []  # nothing says yet where the dive begins
     feed.start()
     try:
         frames: list[Frame | Dropped] = []
@@ -109,7 +109,7 @@ def test_a_new_dive_counts_from_its_first_frame_with_the_samples_before_it(tmp_p
         shift_ns = feed.continued.shift_ns
         assert shift_ns is not None
         assert frames[0].t_ns == 0
-        sample = feed.latest_samples.taken()[0]
+        sample = feed.latest_samples.take_new()[0]
         assert (sample.t_ns, sample.arrival_ns) == (7 + shift_ns, 8 + shift_ns)
     finally:
         feed.close()

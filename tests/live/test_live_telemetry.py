@@ -16,7 +16,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.alignment import align
 from aquaflow.lab.evaluation.trajectory import read_tum
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.checkpoint.set_aside import SetAside
 from aquaflow.live.checkpoint.telemetry import cut_at_checkpoint
 from aquaflow.live.clock_reading import ClockReading
@@ -61,7 +61,7 @@ def telemetry_of(recording: Path) -> TelemetryInput:
 def begun(recording: Path, folder: Path) -> tuple[LiveDive, ToldFeed, Iterator[Event]]:
     source, feed = open_recording(recording), ToldFeed()
     feed.calibration, feed.mounting = source.camera, mounting_of(source)
-    dive = LiveDive("live", resumed(folder, False), feed, VehicleConfig.model_validate(ASKED))
+    dive = LiveDive("live", resume_folder(folder, False), feed, VehicleConfig.model_validate(ASKED))
     return dive, feed, Playback(source, telemetry_of(recording).synchronised).events()
 
 

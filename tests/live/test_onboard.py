@@ -88,7 +88,7 @@ class Service:
         self.dives: list[FakeDive] = []
         self.idle: list[Callable[[], None]] = [self.control.stopping.set]
         """What happens in the turns without a dive, one after the other."""
-        monkeypatch.setattr(module, "begun", self._begin)
+        monkeypatch.setattr(module, "begin_dive", self._begin)
         monkeypatch.setattr(ServiceFrontends, "show", lambda station, dive: None)
         monkeypatch.setattr("aquaflow.live.idle_loop.TURN_S", 0.01)
         self.station.standby.watchers.append(self._turn)
@@ -261,11 +261,11 @@ def test_a_finishing_that_takes_far_longer_than_its_time_is_hung() -> None:
     with ServiceHealth(VEHICLE.service) as vitals:
         now = vitals.heartbeats._now_s()
         vitals.heartbeats.beat(STAGE, ahead_s=100.0)
-        assert vitals.heartbeats.hung(60.0) is None
+        assert vitals.heartbeats.find_hung_stage(60.0) is None
         vitals.heartbeats._now_s = lambda: now + 155.0
-        assert vitals.heartbeats.hung(60.0) is None
+        assert vitals.heartbeats.find_hung_stage(60.0) is None
         vitals.heartbeats._now_s = lambda: now + 165.0
-        assert vitals.heartbeats.hung(60.0) == STAGE
+        assert vitals.heartbeats.find_hung_stage(60.0) == STAGE
         vitals.heartbeats.retire(STAGE)
 
 

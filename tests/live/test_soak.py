@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.live_dive import LiveDive
 from tests.live.live_scenes import ToldFeed
 from tests.live.soak import Rounds, Sample, Sampler, descriptors, soak, summary
@@ -42,7 +42,9 @@ def test_views_files_threads_and_descriptors_of_a_live_dive_are_bounded(
     small_recording: Path, tmp_path: Path
 ) -> None:
     before = threading.active_count(), descriptors()
-    with LiveDive("soak", resumed(tmp_path / "dive", True), ToldFeed(), BOUNDED, True) as dive:
+    with LiveDive(
+        "soak", resume_folder(tmp_path / "dive", True), ToldFeed(), BOUNDED, True
+    ) as dive:
         sampler = Sampler(dive, every=8, file=tmp_path / "soak.csv")
         for frame in itertools.islice(Rounds(small_recording, 0).pictures(), ROUNDS * 24):
             dive.parts.loop.take(frame)

@@ -24,7 +24,7 @@ from aquaflow.render.contract import Renderer
 from aquaflow.render.views import View
 from aquaflow.water.estimation import WaterEstimate
 from aquaflow.water.image_formation import WaterParameters
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 
 Array = npt.NDArray[np.float64]
 
@@ -180,7 +180,7 @@ def fit_water(
     scene: Scene, views: list[View], generator: torch.Generator, dive: list[View] | None = None
 ) -> WaterEstimate | None:
     """The whole fit, its pauses left out; adopted for all views of the dive."""
-    estimate, fitted = finished(fitting_water(scene, views, generator))
+    estimate, fitted = run_to_end(fitting_water(scene, views, generator))
     if estimate is not None:
         adopt_water(scene, estimate, fitted, views if dive is None else dive)
     return estimate

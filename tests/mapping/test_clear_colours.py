@@ -13,7 +13,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.water_summary import summarise_water
 from aquaflow.mapping.clear_colours import mean_water, restored_gaussians, restored_radiance
-from aquaflow.mapping.map_copy import copied
+from aquaflow.mapping.map_copy import copy_map
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import drawn_without_water
 from aquaflow.render.activation import radiance
@@ -92,7 +92,7 @@ def test_ply_viewer_and_frames_show_the_same_bounded_colours(tmp_path: Path) -> 
     J = radiance(mapper.gaussians.parameters["raw_colours"])
     expected = restored_gaussians(mapper.scene, J, mapper.views).numpy()
     assert np.abs(expected - (J * torch.tensor(BALANCE.gain)).numpy()).max() > 0.02
-    np.testing.assert_allclose(copied(mapper).clear, expected, atol=1e-6)
+    np.testing.assert_allclose(copy_map(mapper).clear, expected, atol=1e-6)
     folder = DiveFolder(tmp_path / "dive", Config())
     folder.write_splats(mapper, summarise_water(mapper), WorldFrame.unknown())
     np.testing.assert_allclose(read_ply(folder.path / "map_clear.ply").colours, expected, atol=1e-5)

@@ -91,10 +91,10 @@ def test_a_fit_looks_at_views_spread_over_the_whole_dive(fits: Fits) -> None:
 def test_a_fit_begins_again_when_the_maps_unit_has_changed(fits: Fits) -> None:
     paced = fitting(first_fit_views=2)
     paced.go_on(views(2))
-    paced.moved({0: Sim3(np.eye(3), np.array([0.1, 0.0, 0.0]), 1.001)})
+    paced.follow_moves({0: Sim3(np.eye(3), np.array([0.1, 0.0, 0.0]), 1.001)})
     paced.go_on(views(3))
     assert len(fits.looked) == 1
-    paced.moved({0: Sim3(np.eye(3), np.zeros(3), 1.1)})
+    paced.follow_moves({0: Sim3(np.eye(3), np.zeros(3), 1.1)})
     paced.go_on(views(4))
     assert fits.looked == [[0, 1], [0, 1, 2, 3]]
 

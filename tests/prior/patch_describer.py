@@ -30,7 +30,7 @@ class PatchDescriber:
         self.asked = 0
         self.compared_pairs = 0
 
-    def fitted(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    def fit(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         return image
 
     def features(self, picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float16]:

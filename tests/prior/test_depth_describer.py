@@ -95,7 +95,7 @@ def test_a_network_of_one_size_sees_pictures_with_their_aspect_ratio(
 ) -> None:
     path = folder(tmp_path, {"size": size, "stride": stride})
     describer = DepthDescriber(path, RuntimeSettings(device="cpu"))
-    framed = describer.fitted(painted(HILLS))
+    framed = describer.fit(painted(HILLS))
     assert framed.shape == (*size, 3)
     rows, columns = np.nonzero(framed[..., 2] == 0)  # around it, blue is not 0
     assert (np.ptp(columns) + 1) / (np.ptp(rows) + 1) == pytest.approx(2.0, rel=0.15)
@@ -113,7 +113,7 @@ def test_a_network_of_any_size_gets_as_many_pixels_as_its_card_says(
     shape: tuple[int, int], fitted: tuple[int, int], tmp_path: Path
 ) -> None:
     describer = DepthDescriber(folder(tmp_path), RuntimeSettings(device="cpu"))
-    assert describer.fitted(np.zeros((*shape, 3), np.uint8)).shape == (*fitted, 3)
+    assert describer.fit(np.zeros((*shape, 3), np.uint8)).shape == (*fitted, 3)
 
 
 def test_an_input_with_a_number_of_views_gets_one(tmp_path: Path) -> None:

@@ -44,19 +44,19 @@ def picture(height: int, width: int) -> np.ndarray:
 def test_a_picture_becomes_one_of_whole_tiles_and_no_more_pixels_than_exported_for(
     describer: CompactDescriber, shape: tuple[int, int], fitted: tuple[int, int]
 ) -> None:
-    assert describer.fitted(picture(*shape)).shape == (*fitted, 3)
+    assert describer.fit(picture(*shape)).shape == (*fitted, 3)
 
 
 def test_a_size_that_was_exported_fixed_is_kept_to(tmp_path: Path) -> None:
     describer = CompactDescriber(write_stub(tmp_path / "fixed", 48, 64), CPU)
-    assert describer.fitted(picture(240, 320)).shape == (48, 64, 3)
+    assert describer.fit(picture(240, 320)).shape == (48, 64, 3)
 
 
 def test_every_cell_has_a_descriptor_of_length_one(describer: CompactDescriber) -> None:
     features = describer.features(picture(48, 64))
     assert features.shape == (6, 8, 64)
     camera = CameraModel(64, 48, 64.0, 64.0, 32.0, 24.0)
-    cells, _ = describer.compared(features, features, camera, camera).cells
+    cells, _ = describer.compare(features, features, camera, camera).cells
     np.testing.assert_allclose(np.linalg.norm(cells, axis=-1), 1.0, atol=2e-3)
 
 
@@ -112,6 +112,6 @@ def test_the_range_s_variance_is_what_the_card_makes_of_it(tmp_path: Path) -> No
         describer = CompactDescriber(folder, CPU)
         features = describer.features(picture(48, 64))
         camera = CameraModel(64, 48, 60.0, 60.0, 32.0, 24.0)
-        pair = describer.compared(features, features, camera, camera)
+        pair = describer.compare(features, features, camera, camera)
         variances.append((pair.range_a.variance, pair.range_b.variance))
     np.testing.assert_allclose(variances[1], 4.0 * np.array(variances[0]), rtol=1e-5)

@@ -26,7 +26,7 @@ def test_a_picture_is_as_large_as_fits_in_whole_cells(
     assert (framing.height, framing.width) == inner
     assert framing.top % CELL == framing.left % CELL == 0
     image = np.full((*shape, 3), 200, np.uint8)
-    framed = framing.framed(image)
+    framed = framing.frame(image)
     assert framed.shape == (*frame, 3)
     assert ((framed == 200).all(-1).sum(), (framed == GREY).all(-1).sum()) == (
         inner[0] * inner[1],
@@ -37,7 +37,7 @@ def test_a_picture_is_as_large_as_fits_in_whole_cells(
 @pytest.mark.parametrize("scale", [1, 2, 8])
 def test_what_shows_the_picture_is_cut_out_at_any_resolution(scale: int) -> None:
     framing = ImagePadding.of(270, 480, (384, 512), CELL)
-    framed = framing.framed(np.full((270, 480, 3), 200, np.uint8))[..., 0]
+    framed = framing.frame(np.full((270, 480, 3), 200, np.uint8))[..., 0]
     cut = framing.cut(framed[scale // 2 :: scale, scale // 2 :: scale])
     assert cut.shape == (framing.height // scale, framing.width // scale)
     assert (cut == 200).all()

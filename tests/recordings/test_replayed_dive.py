@@ -23,7 +23,7 @@ def recorded(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) ->
     out = tmp_path_factory.mktemp("recorded")
     recorder = Recorder(out, RecordingConfig(picture="raw", keep_received=False, reserve_mb=0))
     source = open_recording(small_recording)
-    recorder.mounted("camera", mounting_of(source))
+    recorder.record_mounting("camera", mounting_of(source))
     for frame in source.frames():
         recorder.frame("camera", frame)
     for sample in open_recorded_telemetry(small_recording).samples():

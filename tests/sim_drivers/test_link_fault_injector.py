@@ -8,7 +8,7 @@ import time
 import pytest
 
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
-from aquaflow.sim_drivers.faults import Faults, corrupted, faulty, jumping_clock
+from aquaflow.sim_drivers.faults import Faults, corrupt, faulty, jumping_clock
 
 CHUNKS = [bytes([k]) * 10 for k in range(200)]
 
@@ -135,11 +135,11 @@ def test_what_is_written_goes_through():
 
 def test_a_share_of_the_bytes_is_corrupted():
     data = bytes(10_000)
-    changed = corrupted(data, random.Random(1), 0.01)
+    changed = corrupt(data, random.Random(1), 0.01)
 
     assert len(changed) == len(data)
     assert 90 <= sum(map(bool, changed)) <= 100
-    assert corrupted(b"a", random.Random(1)) != b"a"
+    assert corrupt(b"a", random.Random(1)) != b"a"
 
 
 def test_a_clock_jumps_at_its_moment():

@@ -34,7 +34,7 @@ def test_a_connection_closed_while_the_device_reads_it_makes_room_for_the_next(
     assert connected is not None
     with monkeypatch.context() as patch:
         # As if another thread unplugged it after the device had looked for a client.
-        patch.setattr(wire, "_accepted", lambda: connected)
+        patch.setattr(wire, "_accept", lambda: connected)
         wire.unplug()
         assert wire.receive() is None
     assert heard(wire, b"second") == b"second"

@@ -56,7 +56,7 @@ def test_a_consumer_that_waits_without_a_limit_wakes(end: bool) -> None:
     found: list[int | None] = []
     consumer = threading.Thread(target=lambda: found.append(queue.take()), daemon=True)
     consumer.start()
-    assert queue.asked(GIVE_UP_S)
+    assert queue.wait_for_consumer(GIVE_UP_S)
     assert found == []
     if end:
         queue.end()
@@ -68,12 +68,12 @@ def test_a_consumer_that_waits_without_a_limit_wakes(end: bool) -> None:
 
 def test_a_producer_waits_until_a_consumer_found_nothing() -> None:
     queue: Newest[int] = Newest()
-    assert not queue.asked(0.0)
+    assert not queue.wait_for_consumer(0.0)
     queue.take(0.0)
-    assert queue.asked(0.0)  # it will come again
+    assert queue.wait_for_consumer(0.0)  # it will come again
     queue.put(1)
-    assert not queue.asked(0.0)
+    assert not queue.wait_for_consumer(0.0)
     queue.take(0.0)
-    assert not queue.asked(0.0)  # it has something to do
+    assert not queue.wait_for_consumer(0.0)  # it has something to do
     queue.end()
-    assert queue.asked(0.0)  # or the producer would wait without an end
+    assert queue.wait_for_consumer(0.0)  # or the producer would wait without an end

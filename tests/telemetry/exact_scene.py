@@ -128,4 +128,4 @@ class ExactScene:
 def disturbed(state: MetricState, seed: int, size: float) -> MetricState:
     """A state near another, in every parameter."""
     step = size * np.random.default_rng(seed).normal(size=16)
-    return state.moved(step)
+    return state.move(step)

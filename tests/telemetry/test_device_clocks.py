@@ -37,7 +37,7 @@ def test_clocks_that_agree_leave_telemetry_as_it_is() -> None:
     telemetry, path = dive(lambda t: t)
     clocks = DeviceClocks.of(telemetry, path, np.eye(3))
     assert clocks.known
-    assert clocks.corrected(telemetry) is telemetry
+    assert clocks.correct(telemetry) is telemetry
 
 
 @pytest.mark.parametrize("offset_s", [-28.0, -9.0, -0.2, 0.2, 9.0, 28.0])
@@ -48,14 +48,14 @@ def test_an_offset_is_found_and_taken_out_of_every_source(
     telemetry, path = dive(lambda t: t + offset_s)
     clocks = DeviceClocks.of(telemetry, path, mounting)
     assert clocks.reference.latest_s == pytest.approx(-offset_s, abs=0.02)
-    [depth] = clocks.corrected(telemetry).of(Depth)
+    [depth] = clocks.correct(telemetry).of(Depth)
     assert np.abs(depth.values[:, 0] - depth.t_s).max() < 0.05  # depth is the true time here
     assert "corrected" in clocks.reference.in_words()
 
 
 def test_where_a_clock_steps_the_samples_between_are_left_out() -> None:
     telemetry, path = dive(lambda t: t + (5.0 if t > 18.0 else 0.0))
-    [depth] = DeviceClocks.of(telemetry, path, np.eye(3)).corrected(telemetry).of(Depth)
+    [depth] = DeviceClocks.of(telemetry, path, np.eye(3)).correct(telemetry).of(Depth)
     within = (depth.t_s >= 0.0) & (depth.t_s <= 40.0)
     assert within.sum() > 50
     assert np.abs(depth.values[within, 0] - depth.t_s[within]).max() < 0.1

@@ -38,7 +38,7 @@ def full_jacobian(factor: Factor, state: MetricState) -> Array:
         step = np.zeros(P)
         step[k] = STENCIL
         one, two = (
-            factor.residuals(state.moved(n * step)) - factor.residuals(state.moved(-n * step))
+            factor.residuals(state.move(n * step)) - factor.residuals(state.move(-n * step))
             for n in (1, 2)
         )
         columns.append((8.0 * one - two) / (12.0 * STENCIL))
@@ -100,7 +100,7 @@ def test_a_fix_that_is_older_than_it_says_shows_as_lag() -> None:
     factor = PositionFactor("usbl", t[5:15], fixes, np.full(10, 0.1), path)
     step = np.zeros(P)
     step[LAG] = 0.8
-    np.testing.assert_allclose(factor.residuals(state.moved(step)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(factor.residuals(state.move(step)), 0.0, atol=1e-12)
 
 
 def test_the_scale_that_each_displacement_wants_is_the_true_one() -> None:
@@ -108,7 +108,7 @@ def test_the_scale_that_each_displacement_wants_is_the_true_one() -> None:
     velocity = next(f for f in scene.factors() if isinstance(f, VelocityFactor))
     step = np.zeros(P)
     step[SCALE] = -0.02
-    misfit, sigma = velocity.scale_misfit(scene.state.moved(step))
+    misfit, sigma = velocity.scale_misfit(scene.state.move(step))
     np.testing.assert_allclose(misfit, 0.02, rtol=0.05)
     assert (sigma > 0.0).all()
 
@@ -117,7 +117,7 @@ def test_the_scale_that_each_altitude_wants_is_the_true_one() -> None:
     scene = ExactScene.drawn(3, flat=True)
     step = np.zeros(P)
     step[SCALE] = -0.02
-    misfit, sigma = scene.altitude().scale_misfit(scene.state.moved(step))
+    misfit, sigma = scene.altitude().scale_misfit(scene.state.move(step))
     np.testing.assert_allclose(misfit, 0.02, rtol=0.05)
     assert (sigma > 0.0).all()
     assert scene.altitude().rough_log_scale == pytest.approx(scene.state.log_scale)
@@ -147,7 +147,7 @@ def test_a_compass_is_compared_across_the_turn_of_360_degrees() -> None:
     heading = next(f for f in scene.factors() if isinstance(f, HeadingFactor))
     step = np.zeros(P)
     step[14] = 2.0 * np.pi
-    np.testing.assert_allclose(heading.residuals(scene.state.moved(step)), 0.0, atol=1e-8)
+    np.testing.assert_allclose(heading.residuals(scene.state.move(step)), 0.0, atol=1e-8)
 
 
 def test_axes_are_orthonormal_with_the_first_along_the_vector() -> None:

@@ -58,7 +58,7 @@ def test_a_gap_or_no_gyro_says_nothing() -> None:
         recent.add(AngularRate(round(t_s * 1e9), 0, "gyro", (0.1, 0.0, 0.0)))
     assert recent.turn(0.9, 1.51) is None
     assert RecentMotion().turn(0.0, 0.1) is None
-    assert recent.moved(0.0, 0.1) is None
+    assert recent.displacement(0.0, 0.1) is None
 
 
 def test_displacement_is_the_integral_of_the_velocity() -> None:
@@ -67,7 +67,7 @@ def test_displacement_is_the_integral_of_the_velocity() -> None:
     for k in range(20):
         t_ns = 200_000_000 * k
         recent.add(Velocity(t_ns, t_ns, "dvl", (0.1 * k, 0.0, -0.2), 0.01))
-    moved = recent.moved(1.0, 2.0)
+    moved = recent.displacement(1.0, 2.0)
     assert moved is not None
     assert np.allclose(moved, [0.75, 0.0, -0.2], atol=1e-9)
 

@@ -69,7 +69,7 @@ def test_all_instruments_of_an_exact_dive_agree_on_its_state() -> None:
     prior = np.full(P, 0.3)
     factors = [f for f in scene.factors() if f.kind != "dead_reckoning"]
     # Stated mountings are right: what is not observable stays there.
-    start = scene.state.moved(np.concatenate([0.05 * np.ones(7), np.zeros(P - 7)]))
+    start = scene.state.move(np.concatenate([0.05 * np.ones(7), np.zeros(P - 7)]))
     prior[TURN], prior[SCALE], prior[SHIFT] = 3.0, 3.0, 1e3
     prior[HEADING] = 1e-3
     solution = solve(factors, start, prior)

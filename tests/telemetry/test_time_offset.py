@@ -20,7 +20,7 @@ from aquaflow.telemetry.time_offset import (
     TimeOffset,
     estimate_time_offset,
     offset_of_log,
-    synchronised,
+    synchronise_samples,
 )
 from aquaflow.telemetry.turns import Turns
 from aquaflow.types import AngularRate, Attitude, Depth, UtcTime
@@ -218,7 +218,7 @@ def test_too_little_of_either_is_refused() -> None:
     with pytest.raises(NotSynchronisedError, match=r"the log's rotations cover 3\.9 s"):
         estimate_time_offset(case.camera, steady(4.0, 0.1))
     with pytest.raises(NotSynchronisedError, match=r"the video's poses cover 0\.0 s"):
-        estimate_time_offset(Turns.joined([]), case.body)
+        estimate_time_offset(Turns.join([]), case.body)
 
 
 def test_a_log_without_rotations_is_refused_by_name() -> None:
@@ -238,7 +238,7 @@ def test_samples_are_moved_onto_the_videos_clock() -> None:
     offset = TimeOffset(offset_s=2.0, drift=1e-4, middle_s=10.0)
     depth = Depth(10 * 10**9, 10 * 10**9 + 30, "cell", 3.0)
     utc = UtcTime(20 * 10**9, 20 * 10**9, "gnss/ZDA", 1_795_365_000 * 10**9)
-    moved_depth, moved_utc = synchronised([depth, utc], offset)
+    moved_depth, moved_utc = synchronise_samples([depth, utc], offset)
     assert moved_depth == Depth(12 * 10**9, 12 * 10**9 + 30, "cell", 3.0)
     assert moved_utc.t_ns == 22 * 10**9 + 10**6
     assert isinstance(moved_utc, UtcTime)

@@ -20,21 +20,21 @@ from aquaflow.tracking.calibration_check import (
     MAX_VIEWS,
     MIN_VIEWS,
     LensError,
-    estimated,
+    estimate,
     lens_error,
     most_turning,
     pairs_of,
     view_of,
 )
 from aquaflow.tracking.lens_adjustment import adjust_lens
-from aquaflow.tracking.lens_matches import matched
+from aquaflow.tracking.lens_matches import match_pixels
 from tests.tracking.lens_scenes import FOCAL_PX, HALF, swim
 
 CALIBRATION = CameraModel(480, 360, FOCAL_PX, FOCAL_PX, 240.0, 180.0, "radtan", (0.05, 0, 0, 0))
 
 
 def test_a_right_calibration_is_left_alone() -> None:
-    error = estimated(*swim((0.0, 0.0)))
+    error = estimate(*swim((0.0, 0.0)))
 
     assert not error.wrong
     assert verdict(error) == "fits"
@@ -46,7 +46,7 @@ def test_a_right_calibration_is_left_alone() -> None:
 def test_a_wrong_focal_length_or_distortion_is_found_and_measured(
     lens: tuple[float, float],
 ) -> None:
-    error = estimated(*swim(lens))
+    error = estimate(*swim(lens))
 
     assert error.wrong
     assert error.named == (lens[0] != 0.0, lens[1] != 0.0)
@@ -59,11 +59,11 @@ def test_a_wrong_focal_length_or_distortion_is_found_and_measured(
 def test_an_error_that_good_calibrations_have_is_never_a_warning(
     focal: float, radial: float, seed: int, turning: float
 ) -> None:
-    assert not estimated(*swim((focal, radial), turning=turning, seed=seed)).wrong
+    assert not estimate(*swim((focal, radial), turning=turning, seed=seed)).wrong
 
 
 def test_a_camera_that_does_not_turn_says_nothing_of_its_focal_length() -> None:
-    error = estimated(*swim((0.06, 0.0), turning=0.0))
+    error = estimate(*swim((0.06, 0.0), turning=0.0))
 
     assert not error.known[0]
     assert not error.wrong
@@ -79,7 +79,7 @@ def test_an_error_that_no_lens_has_is_no_estimate(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(calibration_check, "adjust_lens", astray)
 
     with pytest.raises(np.linalg.LinAlgError, match="determine no error"):
-        estimated(*swim((0.0, 0.0)))
+        estimate(*swim((0.0, 0.0)))
 
 
 def test_mismatches_do_not_move_the_estimate() -> None:
@@ -88,15 +88,15 @@ def test_mismatches_do_not_move_the_estimate() -> None:
     bad = rng.random(len(observations.matches)) < 0.08
     observations.matches[bad] = rng.uniform(-HALF, HALF, (int(bad.sum()), 2))
 
-    error = estimated(observations, R, centres)
+    error = estimate(observations, R, centres)
 
     assert error.wrong
     assert abs(error.radial - 0.066) < 0.01
 
 
 def test_a_lens_with_further_terms_leaves_the_first_ones_uncertain() -> None:
-    plain = estimated(*swim((0.0, 0.0)))
-    further = estimated(*swim((0.0, 0.0, 0.3, 0.0, 0.01)))
+    plain = estimate(*swim((0.0, 0.0)))
+    further = estimate(*swim((0.0, 0.0, 0.3, 0.0, 0.01)))
 
     assert (further.sigma > 2.0 * plain.sigma).any()
 
@@ -132,7 +132,7 @@ def test_keyframes_at_one_place_that_see_the_same_say_nothing() -> None:
 def test_a_keypoint_seen_in_several_keyframes_is_one_point() -> None:
     keyframes = [keyframe(i, 0.0, keypoints=200) for i in range(3)]
 
-    observations = matched([view_of(each) for each in keyframes], pairs_of(3))
+    observations = match_pixels([view_of(each) for each in keyframes], pairs_of(3))
 
     assert observations is not None
     assert len(observations.points) == 200

@@ -79,7 +79,7 @@ def test_a_keyframe_that_goes_out_of_view_is_replaced_even_by_a_frame_with_snow(
     assert snowy
     scale = 1.0 / result.store[0].pointmap.rho[36, 48] / plane_depth(poses[0])[36, 48]
     for keyframe in snowy:
-        known = keyframe.pointmap.known(0.15)
+        known = keyframe.pointmap.is_known(0.15)
         truth = scale * plane_depth(poses[keyframe.frame_index])[known]
         assert known.any()
         assert np.median(np.abs(1.0 / keyframe.pointmap.rho[known] / truth - 1.0)) < 0.02

@@ -57,9 +57,9 @@ class Swim:
 
     def answer(self) -> None:
         """Every answer is taken."""
-        for each in self.worker.finished(wait=True):
+        for each in self.worker.take_finished(wait=True):
             if isinstance(each.found, ReuseResult):
-                self.tracker.looked(each.found)
+                self.tracker.return_to(each.found)
 
     @contextmanager
     def until_asked(self) -> Iterator[None]:

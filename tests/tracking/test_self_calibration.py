@@ -10,9 +10,9 @@ from aquaflow.geometry.camera import CameraModel, guess_camera
 from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints
-from aquaflow.tracking.lens_matches import MIN_PAIR_MATCHES, LensView, matched
+from aquaflow.tracking.lens_matches import MIN_PAIR_MATCHES, LensView, match_pixels
 from aquaflow.tracking.lens_views import LAST_SPACING, MOST_VIEWS, LensViews, motion
-from aquaflow.tracking.self_calibration import MIN_VIEWS, estimated, found_lens, pairs_of
+from aquaflow.tracking.self_calibration import MIN_VIEWS, estimate, found_lens, pairs_of
 from tests.tracking.lens_scenes import swim
 
 GUESS = guess_camera(480, 360)
@@ -23,7 +23,7 @@ NOTHING = Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.float32))
 def test_focal_length_and_distortion_are_found_from_a_guess_far_off(
     lens: tuple[float, float],
 ) -> None:
-    found = estimated(*swim(lens, views=10, reach=4))
+    found = estimate(*swim(lens, views=10, reach=4))
 
     assert found.known
     error = found.lens[:2] - lens
@@ -36,14 +36,14 @@ def test_focal_length_and_distortion_are_found_from_a_guess_far_off(
 def test_the_stated_sigma_is_the_spread() -> None:
     errors = []
     for seed in range(12):
-        found = estimated(*swim((0.05, 0.05), turning=0.03, views=8, seed=seed, reach=4))
+        found = estimate(*swim((0.05, 0.05), turning=0.03, views=8, seed=seed, reach=4))
         errors.append((found.lens[:2] - 0.05) / found.sigma)
 
     assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def test_sideways_motion_over_a_plane_leaves_the_guess_and_says_so() -> None:
-    found = estimated(*swim((0.1, 0.0), turning=0.0, relief=0.0, views=8))
+    found = estimate(*swim((0.1, 0.0), turning=0.0, relief=0.0, views=8))
 
     assert not found.known
     assert abs(found.lens[0]) < 2.0 * LENS_PRIOR_SIGMA[0]
@@ -75,7 +75,9 @@ def test_pictures_of_different_places_do_not_match() -> None:
     other = rng.normal(size=(400, 64))
     other[: MIN_PAIR_MATCHES - 1] = seen[: MIN_PAIR_MATCHES - 1]
 
-    found = matched([view(pixels, seen), view(pixels, seen), view(pixels, other)], [(0, 1), (0, 2)])
+    found = match_pixels(
+        [view(pixels, seen), view(pixels, seen), view(pixels, other)], [(0, 1), (0, 2)]
+    )
 
     assert found is None or set(found.view) == {1}
 
@@ -92,7 +94,7 @@ def test_a_picture_is_a_view_only_after_motion() -> None:
     for index in range(10):
         views.offer(index, Sim3.identity(), 0, 1.0, lambda: NOTHING)
 
-    assert len(views.posed({index: Sim3.identity() for index in range(10)})) == 1
+    assert len(views.posed_views({index: Sim3.identity() for index in range(10)})) == 1
 
 
 def test_too_many_views_are_thinned_until_neighbours_no_longer_overlap() -> None:
@@ -104,7 +106,7 @@ def test_too_many_views_are_thinned_until_neighbours_no_longer_overlap() -> None
             views.thin()
 
     poses = {i: sideways(0.01, i) for i in range(index)}
-    kept = views.posed(poses)
+    kept = views.posed_views(poses)
     assert len(kept) == MOST_VIEWS
     gap = kept[-1].T_wc.t[0] - kept[-2].T_wc.t[0]
     assert gap * GUESS.fx / GUESS.width == pytest.approx(LAST_SPACING, rel=0.1)
@@ -115,8 +117,8 @@ def test_views_are_of_the_sub_map_with_most_of_them() -> None:
     for index in range(9):
         views.offer(index, sideways(0.1, index), int(index >= 3), 1.0, lambda: NOTHING)
 
-    assert len(views.posed({index: sideways(0.1, index) for index in range(9)})) == 6
-    assert views.posed({}) == []
+    assert len(views.posed_views({index: sideways(0.1, index) for index in range(9)})) == 6
+    assert views.posed_views({}) == []
 
 
 def test_motion_counts_turns_and_the_way_over_the_range() -> None:

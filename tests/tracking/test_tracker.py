@@ -88,7 +88,7 @@ def test_only_frames_for_the_map_carry_a_pointmap_and_it_is_right(swim: Run) -> 
             assert tracked.pointmap is None
             continue
         assert tracked.pointmap is not None
-        known = tracked.pointmap.known(0.15)
+        known = tracked.pointmap.is_known(0.15)
         truth = floor.depth(POSES[tracked.frame.index]) * scale
         ratio = 1.0 / tracked.pointmap.rho[known] / truth[known]
         assert known.mean() > 0.3

@@ -35,7 +35,7 @@ def frame_of(index: int) -> Frame:
 
 
 def as_lost(frame: Frame, reason: str) -> Tracked:
-    return Tracked.lost(frame, 0, reason)
+    return Tracked.as_lost(frame, 0, reason)
 
 
 def entered(count: int, state: Wait) -> WaitingFrames:
@@ -144,7 +144,7 @@ class DrawnTracker(Tracker):
     ) -> Tracked | None:
         assert self._at is not None
         works = self._drawn.works()
-        return self._at.tracked(frame, FrameClass.COMMON, Quality()) if works else None
+        return self._at.tracked_result(frame, FrameClass.COMMON, Quality()) if works else None
 
 
 @given(

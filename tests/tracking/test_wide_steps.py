@@ -161,7 +161,7 @@ def test_what_a_turn_has_just_brought_into_view_gets_its_depth_from_the_next_ste
     solved = tracker.place_after_turn(at, frame, CAMERA, None)
     assert solved is not None
     assert shift_px(solved.estimate.T, T_wc.inverse()) < 3.0
-    assert keyframe.pointmap.known(0.15).mean() > 0.1
+    assert keyframe.pointmap.is_known(0.15).mean() > 0.1
 
 
 def test_a_pose_from_the_rim_of_what_is_known_is_replaced_after_a_turn() -> None:

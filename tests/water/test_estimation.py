@@ -14,7 +14,7 @@ from aquaflow.water.estimation import EVERY_MODEL, MIN_POINTS, WaterEstimate, es
 from aquaflow.water.model import WaterModel
 from aquaflow.water.observations import Observations
 from aquaflow.water.parameters import Model
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 from aquaflow.water.selection import without
 from aquaflow.water.shading import TERMS, shading_basis
 from aquaflow.water.solver import cost, descend
@@ -79,7 +79,7 @@ def test_a_fit_is_where_its_cost_is_least() -> None:
     """A fit that stops before its minimum passes for a poor model."""
     seen = sighted(sightings=5, shading=LAMP, log_gains=DIMMED, noise=0.02)
     problem = WaterModel(seen, Model(True, True, True), B_RES, D)
-    fit = finished(descend(problem, problem.start, 0.02))
+    fit = run_to_end(descend(problem, problem.start, 0.02))
     least = cost(fit.problem, fit.x, fit.prediction, fit.noise)
     deviations = np.sqrt(np.diag(fit.covariance))
     for k in range(problem.size):
@@ -93,9 +93,9 @@ def test_what_a_part_is_worth_follows_from_the_fit_that_has_it() -> None:
     """Savage and Dickey's ratio against the fit without the part."""
     seen = sighted(sightings=5, noise=0.02)
     rich, poor = (WaterModel(seen, Model(True, shading), B_RES, D) for shading in (True, False))
-    fit = finished(descend(rich, rich.start, 0.02))
+    fit = run_to_end(descend(rich, rich.start, 0.02))
     evidence, problem, x = without(fit, poor)
-    alone = finished(descend(poor, poor.start, 0.02))
+    alone = run_to_end(descend(poor, poor.start, 0.02))
     assert problem is poor
     assert evidence == pytest.approx(alone.log_evidence, abs=1.0)
     np.testing.assert_allclose(x, alone.x, atol=0.05)

@@ -20,7 +20,7 @@ def scene(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 def test_restoring_inverts_the_renderers_water_where_light_still_arrives(beta: float) -> None:
     J, z = scene()
     murk = water(beta)
-    image, _ = compose_water(torch.cat([J, z[..., None]], -1), torch.ones_like(z), murk.stacked())
+    image, _ = compose_water(torch.cat([J, z[..., None]], -1), torch.ones_like(z), murk.stack())
     restored, recoverable = murk.restore(image, z)
     assert recoverable.any()
     torch.testing.assert_close(restored[recoverable], J[recoverable], atol=1e-4, rtol=0.0)

@@ -42,7 +42,7 @@ def test_it_starts_as_the_config_says_whichever_way_the_camera_looks() -> None:
     )
     wanted = (0.17, 0.4, 0.17, 0.02, 1.5)
     for R in (AHEAD, DOWN):
-        seen = start(R).stacked()
+        seen = start(R).stack()
         torch.testing.assert_close(seen, torch.tensor(wanted)[:, None].expand(5, 3))
 
 
@@ -108,7 +108,7 @@ def test_every_parameter_gets_a_gradient_once_the_output_layer_has_moved() -> No
     learning = medium(directional=True)
     with torch.no_grad():
         learning.output.weight.fill_(0.01)
-    torch.autograd.backward(learning(DOWN).stacked().square().sum())
+    torch.autograd.backward(learning(DOWN).stack().square().sum())
     for name, parameter in learning.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().max() > 0.0, name

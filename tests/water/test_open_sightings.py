@@ -14,7 +14,7 @@ from aquaflow.render.views import View
 from aquaflow.water.estimation import estimating
 from aquaflow.water.open_sightings import COLUMNS, ROWS, with_open_water
 from aquaflow.water.parameters import Trial
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 from aquaflow.water.posed_picture import PosedPicture
 from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 
@@ -40,7 +40,7 @@ def picture(
 
 def test_each_open_cell_is_an_observation_at_infinity() -> None:
     seen = sighted(points=120)
-    extended = finished(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
+    extended = run_to_end(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
     rows = slice(len(seen.z), None)
     open_rows = COLUMNS * (ROWS // 2 - 1)  # the cells that touch the floor are not all open
     assert 2 * open_rows <= extended.points - seen.points <= 2 * COLUMNS * ROWS // 2
@@ -56,7 +56,7 @@ def test_each_open_cell_is_an_observation_at_infinity() -> None:
 
 def test_observations_of_one_views_open_water_share_their_errors() -> None:
     seen = sighted(points=120)
-    extended = finished(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
+    extended = run_to_end(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
     shared = extended.errors_shared[len(seen.z) :]
     assert len(set(shared.tolist())) == 2
     assert min(shared) > max(extended.errors_shared[: len(seen.z)])
@@ -64,15 +64,15 @@ def test_observations_of_one_views_open_water_share_their_errors() -> None:
 
 def test_pictures_without_open_water_add_nothing() -> None:
     seen = sighted(points=120)
-    assert finished(with_open_water(seen, [picture(np.array([0.9, 0.8, 0.1]))], trial(1))) is seen
-    assert finished(with_open_water(seen, [], trial(1))) is seen
+    assert run_to_end(with_open_water(seen, [picture(np.array([0.9, 0.8, 0.1]))], trial(1))) is seen
+    assert run_to_end(with_open_water(seen, [], trial(1))) is seen
 
 
 def test_a_masked_vehicle_is_no_open_water() -> None:
     seen = sighted(points=120)
     mask = np.ones((120, 160), bool)
     mask[:60] = False
-    assert finished(with_open_water(seen, [picture(B_INF, mask)], trial(1))) is seen
+    assert run_to_end(with_open_water(seen, [picture(B_INF, mask)], trial(1))) is seen
 
 
 def test_open_water_pins_what_the_surface_leaves_open() -> None:
@@ -84,7 +84,7 @@ def test_open_water_pins_what_the_surface_leaves_open() -> None:
     noise = 0.01 * np.random.default_rng(1).normal(size=J.shape)
     near = replace(near, colour=J * np.exp(-BETA * path) - B_INF * np.expm1(-B * path) + noise)
     without = fitted(near)
-    found = finished(estimating(near, B_RES, D, pictures=[picture(B_INF)] * 4))
+    found = run_to_end(estimating(near, B_RES, D, pictures=[picture(B_INF)] * 4))
     assert found is not None
     errors = [np.abs(np.log(each.B_inf / B_INF)).max() for each in (without, found)]
     assert errors[1] < 0.1

@@ -12,7 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water import sightings
 from aquaflow.water.observations import Observations
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 from aquaflow.water.posed_picture import PosedPicture
 from aquaflow.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, sighting
 
@@ -48,7 +48,7 @@ def wall_picture(
 
 
 def looked(pictures: list[PosedPicture]) -> Observations:
-    return finished(sighting(pictures, np.random.default_rng(0)))
+    return run_to_end(sighting(pictures, np.random.default_rng(0)))
 
 
 def test_a_patch_has_the_same_colour_from_near_and_far() -> None:
@@ -113,7 +113,7 @@ def test_a_masked_vehicle_is_not_sighted() -> None:
     for centre in BACKING:
         whole = wall_picture(centre)
         z = ranges_of_the_wall(centre).astype(np.float32)
-        image = np.rint(whole.sampled(CAMERA.pixel_centres(), np.full(120, 0.1)) * 255.0)
+        image = np.rint(whole.sample(CAMERA.pixel_centres(), np.full(120, 0.1)) * 255.0)
         view = View(0, image.astype(np.uint8), CAMERA, Sim3(np.eye(3), centre), 0, False, view_mask)
         pictures.append(PosedPicture(view, torch.from_numpy(z), torch.ones(120, 160)))
     seen = looked(pictures)

@@ -12,7 +12,7 @@ from aquaflow.water.estimation import EVERY_MODEL, WaterEstimate, estimating
 from aquaflow.water.model import BELIEVED
 from aquaflow.water.observations import Observations
 from aquaflow.water.parameters import Model
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 from aquaflow.water.shading import shading_basis
 
 Array = npt.NDArray[np.float64]
@@ -63,7 +63,7 @@ def estimate_water(
     priors: WaterPriorsConfig = BELIEVED,
 ) -> WaterEstimate | None:
     """The whole fit, its pauses left out."""
-    return finished(estimating(seen, B_res, d, models, priors))
+    return run_to_end(estimating(seen, B_res, d, models, priors))
 
 
 def fitted(seen: Observations) -> WaterEstimate:

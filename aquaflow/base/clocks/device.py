@@ -143,7 +143,7 @@ class ClockMapping:
         self._contradictions.clear()
         self._learn(device_ns, arrival_ns, round_trip_ns)
 
-    def learned(self) -> Learned:
+    def learned_mapping(self) -> Learned:
         """What :meth:`resume` takes; may be called from another thread than ``add`` is."""
         return [astuple(bucket) for bucket in tuple(self._buckets)]
 

@@ -79,11 +79,11 @@ def _ours(error: Exception) -> str:
     place = "".join(f" in {Path(frame.filename).name} line {frame.lineno}" for frame in where)
     return (
         f"a mistake in AquaFlow itself ({type(error).__name__}{place}), not in what you gave it; "
-        f"please report it with {_kept(error)}"
+        f"please report it with {_keep_traceback(error)}"
     )
 
 
-def _kept(error: Exception) -> str:
+def _keep_traceback(error: Exception) -> str:
     """The file that holds the traceback of the last mistake; only its owner may read it."""
     text = f"aquaflow {__version__}, Python {sys.version}\n{' '.join(sys.argv)}\n"
     text += "".join(traceback.format_exception(error))

@@ -172,7 +172,7 @@ class Failures:
         with self._lock:
             return self._reasons.pop(frame, None)
 
-    def repeated(self) -> list[str]:
+    def list_repeated(self) -> list[str]:
         """Stages that failed again and again within the last minute, in words."""
         since = self._now_s() - RECENT_S
         with self._lock:

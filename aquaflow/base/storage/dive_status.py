@@ -81,7 +81,7 @@ def read_status(dive: Path) -> DiveStatus | None:
     return status
 
 
-def unfinished(dive: Path) -> str | None:
+def unfinished_reason(dive: Path) -> str | None:
     """What keeps a dive's files from being those of a finished dive, and what to do about it, in a
     sentence; None of a finished dive, and of a folder that is no dive.
 
@@ -130,7 +130,7 @@ def refuse_unfinished(dive: Path) -> None:
     Raises:
         InputError: they are not; what happened, and what to do.
     """
-    said = unfinished(dive)
+    said = unfinished_reason(dive)
     if said is not None:
         raise InputError(said)
 

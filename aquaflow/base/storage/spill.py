@@ -149,7 +149,7 @@ class Spill(Generic[T]):
             self._saved.add(number)
         return found
 
-    def removed(self) -> set[int]:
+    def removed_numbers(self) -> set[int]:
         """Numbers whose files this run or an earlier one removed; without a file, any other one
         was lost."""
         if self._folder is None:

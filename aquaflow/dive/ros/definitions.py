@@ -56,6 +56,6 @@ def definition(name: str) -> bytes:
     return str(text).encode()
 
 
-def encoded(message: Any) -> bytes:
+def encode(message: Any) -> bytes:
     """The message as CDR, little endian."""
     return bytes(_store().serialize_cdr(message, message.__msgtype__))

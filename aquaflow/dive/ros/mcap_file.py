@@ -14,7 +14,7 @@ from aquaflow.dive.ros.definitions import (
     MESSAGE_ENCODING,
     SCHEMA_ENCODING,
     definition,
-    encoded,
+    encode,
     require_rosbags,
 )
 from aquaflow.dive.ros.topics import LASTING, TYPES
@@ -54,7 +54,7 @@ class RosFile:
             self._channels[topic] = self._writer.register_channel(
                 topic, MESSAGE_ENCODING, self._schemas[name], {"offered_qos_profiles": qos}
             )
-        self._writer.add_message(self._channels[topic], t_ns, encoded(message), t_ns, self.count)
+        self._writer.add_message(self._channels[topic], t_ns, encode(message), t_ns, self.count)
         self.count += 1
 
 

@@ -66,7 +66,7 @@ def run_batch(
     cache = batch.cache or _cache_for(site)
     recordings = find_recordings(dives)
     make_site(site, sites)
-    with _held(site, cache) as folder:
+    with _hold_journal(site, cache) as folder:
         jobs = _jobs(recordings, site, settings, calibration, str(cache), progress)
         journal = Journal(folder / JOURNAL)
         try:
@@ -86,7 +86,7 @@ def run_batch(
 
 
 @contextlib.contextmanager
-def _held(site: str, cache: Path) -> Iterator[Path]:
+def _hold_journal(site: str, cache: Path) -> Iterator[Path]:
     """The local folder of the journal, which no other batch gets meanwhile."""
     folder = cache if is_url(site) else Path(site)
     try:

@@ -62,7 +62,7 @@ class Cluster:
         task = self._attempt.options(num_cpus=cores, memory=int(memory), name=job.name)
         self._running[task.remote(job.to_json())] = job.name
 
-    def ended(self) -> list[tuple[str, dict[str, Any]]]:
+    def take_ended(self) -> list[tuple[str, dict[str, Any]]]:
         """Names and outcomes of the jobs that ended since; waits a little."""
         if not self._running:
             return []
@@ -102,7 +102,7 @@ def _serve(cluster: Cluster, asked: queue.SimpleQueue[str | None], answers: IO[s
     while True:
         nodes = cluster.nodes()
         _say(answers, cores=sum(node.get("CPU", 0.0) for node in nodes), nodes=len(nodes))
-        for name, outcome in cluster.ended():
+        for name, outcome in cluster.take_ended():
             _say(answers, done=name, outcome=outcome)
         try:
             line = asked.get(timeout=LOOK_S)

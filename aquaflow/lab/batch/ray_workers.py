@@ -68,7 +68,7 @@ class RayWorkers:
             self._process.stdin.write(json.dumps(job.to_json()).encode() + b"\n")
             self._process.stdin.flush()
         except OSError as error:
-            raise self._gone("its driver ended") from error
+            raise self._lost_workers_error("its driver ended") from error
 
     def wait(self, timeout_s: float) -> tuple[str, BatchOutcome] | None:
         """The next job that ends."""
@@ -79,13 +79,13 @@ class RayWorkers:
                 message = self._messages.get(timeout=left_s)
             except queue.Empty:
                 if time.monotonic() - self._heard_s > SILENT_S:
-                    raise self._gone("it is silent") from None
+                    raise self._lost_workers_error("it is silent") from None
                 return None
             self._heard_s = time.monotonic()
             if message is None:
-                raise self._gone("it ended")
+                raise self._lost_workers_error("it ended")
             if "failed" in message:
-                raise self._gone(str(message["failed"]))
+                raise self._lost_workers_error(str(message["failed"]))
             self._cores = message.get("cores", self._cores)
             if "done" in message:
                 self._running.discard(message["done"])
@@ -102,6 +102,6 @@ class RayWorkers:
             self._messages.put(json.loads(line))
         self._messages.put(None)
 
-    def _gone(self, why: str) -> InputError:
+    def _lost_workers_error(self, why: str) -> InputError:
         begun = "; give the same command again to go on" if self._cores else ""
         return InputError(f"the Ray cluster at {self._address} cannot be used ({why}){begun}")

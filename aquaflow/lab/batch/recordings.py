@@ -118,10 +118,10 @@ def _names(sources: list[str]) -> list[str]:
     """A name for each: that of the file without its suffix; with the folder's before it where two
     would be alike."""
     parts = [PurePosixPath(source.rstrip("/")) for source in sources]
-    short = [_printed(part.stem if part.stem else part.name) for part in parts]
+    short = [_printable(part.stem if part.stem else part.name) for part in parts]
     often = Counter(short)
     names = [
-        name if often[name] == 1 else f"{_printed(part.parent.name)}_{_printed(part.name)}"
+        name if often[name] == 1 else f"{_printable(part.parent.name)}_{_printable(part.name)}"
         for name, part in zip(short, parts, strict=True)
     ]
     for name, count in Counter(names).items():
@@ -130,5 +130,5 @@ def _names(sources: list[str]) -> list[str]:
     return names
 
 
-def _printed(name: str) -> str:
+def _printable(name: str) -> str:
     return printable(name).lstrip(".").replace("/", "_").replace("\\", "_") or "dive"

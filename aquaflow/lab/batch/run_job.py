@@ -54,7 +54,7 @@ def _attempt(job: BatchJob, started: RunningProcesses) -> BatchOutcome:
             "install the same on every machine"
         )
     site = open_site(job.site)
-    found = site.finished(job)
+    found = site.finished_outcome(job)
     if found is not None:
         return found
     with working_folder(site.work_parent(job), job.name) as work:
@@ -120,10 +120,10 @@ def _answer(process: subprocess.Popen[bytes], asked: bytes, memory_mb: int) -> B
     try:
         return BatchOutcome(**json.loads(text), **measured)
     except (ValueError, TypeError):
-        return BatchOutcome("lost", _died(process.returncode, memory_mb), **measured)
+        return BatchOutcome("lost", _death_message(process.returncode, memory_mb), **measured)
 
 
-def _died(code: int, memory_mb: int) -> str:
+def _death_message(code: int, memory_mb: int) -> str:
     if code == -Signals.SIGKILL:
         return (
             f"its process was killed; if that was for want of memory ({memory_mb} MB were expected)"

@@ -105,7 +105,7 @@ def _settle(
     season.outcomes[name] = outcome
 
 
-def failed(season: Season, jobs: Sequence[BatchJob]) -> list[BatchJob]:
+def failed_jobs(season: Season, jobs: Sequence[BatchJob]) -> list[BatchJob]:
     """Jobs without a dive."""
     outcomes = season.outcomes
     return [j for j in jobs if j.name not in outcomes or outcomes[j.name].state not in WRITTEN]

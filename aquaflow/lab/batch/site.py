@@ -17,7 +17,7 @@ DIVES = "dives"
 class DiveStore(Protocol):
     """Takes finished dives."""
 
-    def finished(self, job: BatchJob) -> BatchOutcome | None:
+    def finished_outcome(self, job: BatchJob) -> BatchOutcome | None:
         """What came of ``job`` if its dive is there already, else None.
 
         Raises:
@@ -49,7 +49,7 @@ class FolderSite:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def finished(self, job: BatchJob) -> BatchOutcome | None:
+    def finished_outcome(self, job: BatchJob) -> BatchOutcome | None:
         dive = self.path / DIVES / job.name
         if not dive.exists():
             return None
@@ -80,7 +80,7 @@ class StoreSite:
     def __init__(self, url: str) -> None:
         self.store = ObjectStore(url)
 
-    def finished(self, job: BatchJob) -> BatchOutcome | None:
+    def finished_outcome(self, job: BatchJob) -> BatchOutcome | None:
         where = f"{self.store.url}/{DIVES}/{job.name}"
         text = self.store.read(f"{DIVES}/{job.name}/{MANIFEST}")
         return None if text is None else earlier_outcome(read_manifest(text, where), job, where)
@@ -89,7 +89,7 @@ class StoreSite:
         return Path(job.cache)
 
     def publish(self, dive: Path, job: BatchJob) -> None:
-        if self.finished(job) is not None:  # another machine, thought dead, was first
+        if self.finished_outcome(job) is not None:  # another machine, thought dead, was first
             return
         to = f"{DIVES}/{job.name}"
         self.store.remove(to)  # of an attempt that was cut off

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from aquaflow.base.errors import AquaFlowError, InputError
-from aquaflow.config.presets import merged
+from aquaflow.config.presets import merge
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.runner import Perform, Progress, Row, in_process, row_of
@@ -113,7 +113,7 @@ PARTS = (
     AblatedPart("with neural Gaussians, without distance embedding", _decoder(distance=False)),
     AblatedPart("with neural Gaussians, an MLP instead of LGPD", _decoder(variant="mlp")),
     *(
-        AblatedPart(f"with {name}{without}", merged({"prior": prior}, overrides), oracle=oracle)
+        AblatedPart(f"with {name}{without}", merge({"prior": prior}, overrides), oracle=oracle)
         for name, prior, oracle in LEARNED
         for without, overrides in WITHOUT
     ),
@@ -192,7 +192,7 @@ def ablate(
             folder = str(out / "ablation" / f"dive_{done:03d}")
             overrides = part.overrides
             if part.oracle:
-                overrides = merged(overrides, {"prior": {"folder": str(_oracle(scene, out))}})
+                overrides = merge(overrides, {"prior": {"folder": str(_oracle(scene, out))}})
             job = BenchJob(scene, PRESET, folder, overrides=overrides)
             found[part.name].append(row_of(job, machine.load(), perform(job)))
             done += 1

@@ -54,9 +54,9 @@ def ci_scenes(cache: Path, progress: Progress) -> list[BenchmarkScene]:
     total, scenes = len(PLAIN) + 2, []
     for done, (name, kind) in enumerate(PLAIN.items()):
         progress("scenes", done, total)
-        scenes.append(_cached(cache, name, {**SMALL, **kind}, _write))
+        scenes.append(_cache(cache, name, {**SMALL, **kind}, _write))
     piped = {**SMALL, **PIPE}
-    pipe = Path(_cached(cache, "pipe", piped, _write).recording)
+    pipe = Path(_cache(cache, "pipe", piped, _write).recording)
     reef = next(Path(scene.recording) for scene in scenes if scene.name == DIMMED_FROM)
 
     def paused(out: Path, _: dict[str, object]) -> None:
@@ -67,8 +67,8 @@ def ci_scenes(cache: Path, progress: Progress) -> list[BenchmarkScene]:
 
     stopped = {**piped, "pause": [PAUSE_AT, PAUSE_FRAMES]}
     darker = {**SMALL, **PLAIN[DIMMED_FROM], "dim": [DIM_AT, DIM_GAIN]}
-    scenes.append(_cached(cache, PAUSED, stopped, paused))
-    scenes.append(_cached(cache, DIMMED, darker, dimmed))
+    scenes.append(_cache(cache, PAUSED, stopped, paused))
+    scenes.append(_cache(cache, DIMMED, darker, dimmed))
     progress("scenes", total, total)
     return scenes
 
@@ -77,7 +77,7 @@ def _write(out: Path, settings: dict[str, object]) -> None:
     write_dive(out, SyntheticConfig.model_validate(settings))
 
 
-def _cached(
+def _cache(
     cache: Path,
     name: str,
     settings: dict[str, object],

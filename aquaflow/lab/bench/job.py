@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from aquaflow.config import Config, parse_config
-from aquaflow.config.presets import merged, preset
+from aquaflow.config.presets import merge, preset
 from aquaflow.lab.bench.scene import BenchmarkScene
 
 RENDERERS = {"cpu": "cpu", "cuda": "gsplat"}
@@ -32,13 +32,13 @@ class BenchJob:
 
     def config(self) -> Config:
         """The scene's settings, then the preset's, then this job's own."""
-        wanted = merged(merged(Config().model_dump(), self.scene.overrides), preset(self.preset))
+        wanted = merge(merge(Config().model_dump(), self.scene.overrides), preset(self.preset))
         steps = wanted["mapping"]["optimiser"]["refine_steps"]
         wanted["mapping"]["optimiser"]["refine_steps"] = round(self.scene.refine_share * steps)
         if self.device is not None:
             wanted["mapping"]["renderer"] = RENDERERS[self.device]
             wanted["prior"]["device"] = self.device
-        return parse_config(merged(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
+        return parse_config(merge(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
 
     def to_text(self) -> str:
         """As JSON, for the worker process."""

@@ -55,7 +55,7 @@ def perform(job: BenchJob) -> dict[str, Any]:
         if job.config().mapping.enabled and metrics["gaussians"] == 0:
             raise NotMappedError(f"{scene.name}: {'; '.join(metrics['warnings'])}")
     peak_mb = peak_memory_mb()  # before the evaluation, whose memory is not the run's
-    return {**metrics, **measured(scene, out), "peak_rss_mb": peak_mb}
+    return {**metrics, **measure_errors(scene, out), "peak_rss_mb": peak_mb}
 
 
 if __name__ == "__main__":
@@ -82,7 +82,7 @@ RESTORED = (
 """Of held-out views without water: ours, the camera's, those of published methods."""
 
 
-def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
+def measure_errors(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
     """Every error that the scene's truth allows; null where it does not.
 
     Raises:

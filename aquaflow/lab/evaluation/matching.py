@@ -1,7 +1,7 @@
 """How well a prior finds pixels again: pictures against themselves, turned, shifted and relit.
 
 A homography gives every pixel its true match, so that real pictures can be used, whose geometry
-is unknown (docs/measurements.md#compact-prior has the figures of the prototypes).
+is unknown (notes/measurements.md#compact-prior has the figures of the prototypes).
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ class Distortion:
     """1/px"""
 
     @classmethod
-    def scaled(cls, name: str, by: float) -> Distortion:
+    def scale(cls, name: str, by: float) -> Distortion:
         """``by`` times the medium level."""
         return cls(name, 20.0 * by, (45.0 * by, 35.0 * by), 0.2 * by, 4e-4 * by)
 
 
 LEVELS = (
-    Distortion.scaled("mild", 0.3),
-    Distortion.scaled("medium", 1.0),
-    Distortion.scaled("hard", 1.6),
+    Distortion.scale("mild", 0.3),
+    Distortion.scale("medium", 1.0),
+    Distortion.scale("hard", 1.6),
 )
 """Easy to hard; shares of the same largest motion."""
 

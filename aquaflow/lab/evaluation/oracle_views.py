@@ -43,7 +43,7 @@ def make_oracle(
         InputError: there is no truth, or it does not fit the recording.
     """
     found = []
-    for view in _synthetic(recording) if dive is None else _mapped(recording, dive):
+    for view in _synthetic(recording) if dive is None else _mapped_frames(recording, dive):
         found.append(view)
         progress("views", len(found), None)
     if not found:
@@ -56,12 +56,12 @@ def _synthetic(recording: Path) -> Iterator[tuple[TrueView, CameraModel]]:
     from aquaflow.lab.synthetic.truth import read_truth
 
     truth = read_truth(recording)
-    for frame in _prepared(recording, SourceConfig(), truth.camera):
+    for frame in _prepare(recording, SourceConfig(), truth.camera):
         T = truth.T_wc[frame.index]
         yield _view(frame, truth.range_m(frame.index), Sim3(T[:3, :3], T[:3, 3]))
 
 
-def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel]]:
+def _mapped_frames(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel]]:
     """The frames that the map's own sub-map placed, with the ranges that the map shows."""
     from aquaflow.dive.map_file import read_map_file  # torch, which no other kind needs
     from aquaflow.render import select_renderer
@@ -74,7 +74,7 @@ def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel
     found = evaluated_dive(read).trajectory
     placed = zip(found.R_wc, found.positions, strict=True)
     poses = dict(zip(np.round(1e6 * found.t_s), placed, strict=True))
-    for frame in _prepared(recording, read.config.source, read.calibration):
+    for frame in _prepare(recording, read.config.source, read.calibration):
         pose = poses.get(round(1e-3 * frame.t_ns))
         if pose is None:
             continue
@@ -84,7 +84,7 @@ def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel
         yield _view(frame, ranges, T_mc)
 
 
-def _prepared(recording: Path, source: SourceConfig, camera: CameraModel | None) -> Iterator[Frame]:
+def _prepare(recording: Path, source: SourceConfig, camera: CameraModel | None) -> Iterator[Frame]:
     reader = open_recording(recording, fps=source.fps)
     prepare = Preparation(source, camera or reader.camera)
     try:

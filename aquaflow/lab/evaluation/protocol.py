@@ -101,7 +101,7 @@ def evaluate_dive(
     notes = _notes_on(estimate)
     estimated, true = estimate.trajectory, None
     if known.trajectory is not None:
-        estimated, true, path = _paired(estimate.trajectory, known.trajectory, tolerance_s, truth)
+        estimated, true, path = _pair(estimate.trajectory, known.trajectory, tolerance_s, truth)
         error = trajectory_error(estimated, true, path)
     else:
         assert known.positions is not None
@@ -134,7 +134,7 @@ def _notes_on(dive: EvaluatedDive) -> list[str]:
     ]
 
 
-def _paired(
+def _pair(
     estimate: Trajectory, truth: Trajectory, tolerance_s: float, source: Path
 ) -> tuple[Trajectory, Trajectory, float]:
     """The poses of the same moments, and the length of the true path."""

@@ -80,8 +80,8 @@ def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restorati
     """
     indices = _held_out(dive)
     reference = clean_pictures(dive, clean, crop, indices)
-    raw, _ = _stored(dive, indices, "real")
-    restored, opaque = _stored(dive, indices, "restored")
+    raw, _ = _load_stored(dive, indices, "real")
+    restored, opaque = _load_stored(dive, indices, "restored")
     if reference.shape != raw.shape:
         raise InputError(
             f"{clean} is {reference.shape[2]} x {reference.shape[1]} once prepared like the dive, "
@@ -133,7 +133,9 @@ def _held_out(dive: Path) -> list[int]:
     return indices
 
 
-def _stored(dive: Path, indices: list[int], kind: Kind) -> tuple[Pictures, npt.NDArray[np.bool_]]:
+def _load_stored(
+    dive: Path, indices: list[int], kind: Kind
+) -> tuple[Pictures, npt.NDArray[np.bool_]]:
     """The pictures, and where they show something [N, H, W]."""
     pictures, shown = zip(*(read_picture(dive, index, kind) for index in indices), strict=True)
     return _in_unit(list(pictures)), np.stack(shown)

@@ -65,19 +65,19 @@ def _metric(result: Values) -> list[str]:
         return []
     lines = [
         "Metres, gravity and north as the dive states them",
-        _row("scale error", _stated(metric, "scale", "pct", "%")),
+        _row("scale error", _error_in_words(metric, "scale", "pct", "%")),
     ]
     if metric["gravity_error_deg"] is not None:
-        lines.append(_row("gravity error", _stated(metric, "gravity", "deg", "degrees")))
+        lines.append(_row("gravity error", _error_in_words(metric, "gravity", "deg", "degrees")))
     if metric["heading_error_deg"] is not None:
-        lines.append(_row("heading error", _stated(metric, "heading", "deg", "degrees")))
+        lines.append(_row("heading error", _error_in_words(metric, "heading", "deg", "degrees")))
     if metric["ate_rmse_m_level"] is not None:
         said = f"{metric['ate_rmse_m_level']:.4g} m rms, only turned about the vertical and shifted"
         lines.append(_row("error, level", said))
     return lines
 
 
-def _stated(metric: Values, what: str, unit: str, word: str) -> str:
+def _error_in_words(metric: Values, what: str, unit: str, word: str) -> str:
     """An error with its stated sigma, and how many of them it is."""
     said = f"{metric[f'{what}_error_{unit}']:.3g} {word}"
     sigma, sigmas = metric[f"{what}_sigma_{unit}"], metric[f"{what}_error_sigmas"]

@@ -14,8 +14,8 @@ import numpy as np
 
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import Config, PriorConfig, parse_config
-from aquaflow.config.presets import merged
-from aquaflow.config.stage import validated
+from aquaflow.config.presets import merge
+from aquaflow.config.stage import validate
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.bench import machine
@@ -67,7 +67,7 @@ def methods_here(device: str) -> Methods:
     usable: list[Method] = [DenseMethod("classical", make_prior(PriorConfig(kind="classical")))]
     missing = []
     settings = {"kind": "compact", "device": device}
-    compact = make_prior(validated(PriorConfig, settings, "command line"))
+    compact = make_prior(validate(PriorConfig, settings, "command line"))
     if compact.name == "compact":
         usable.append(DenseMethod("compact", compact))
     else:
@@ -181,7 +181,7 @@ def clip_pairs(folder: Path, count: int) -> list[KnownPair]:
     if scene is None or missing:
         lacking = " and ".join(missing) or "video or pictures"
         raise InputError(f"{folder} has no {lacking}; give the folder of a clip with its poses")
-    config = parse_config(merged(Config().model_dump(), scene.overrides), str(folder))
+    config = parse_config(merge(Config().model_dump(), scene.overrides), str(folder))
     frames, truth = prepared_frames(scene, config).frames, read_tum(folder / TRUTH)
     ours, theirs = associate(
         np.array([frame.t_ns * 1e-9 for frame in frames]), truth.t_s, ASSOCIATION_TOLERANCE_S
@@ -190,10 +190,10 @@ def clip_pairs(folder: Path, count: int) -> list[KnownPair]:
         (frames[i], Sim3(truth.R_wc[j], truth.positions[j]))
         for i, j in zip(ours, theirs, strict=True)
     ]
-    return [pair for n in SPACINGS for pair in _spaced(folder.name, known, n, count)]
+    return [pair for n in SPACINGS for pair in _space(folder.name, known, n, count)]
 
 
-def _spaced(
+def _space(
     name: str, known: Sequence[tuple[Frame, Sim3]], spacing: int, count: int
 ) -> list[KnownPair]:
     both = list(zip(known, known[spacing:], strict=False))

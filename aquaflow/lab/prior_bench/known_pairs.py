@@ -42,7 +42,7 @@ def generated_pairs(folder: Path, count: int) -> list[KnownPair]:
             clear = pool.pairs(torch.arange(number, number + SHARD))
             wet, enough = through_water(draw, clear), overlap(clear) >= LEAST_OVERLAP
             rows = torch.nonzero(enough)[:, 0].tolist()[: count - (len(found) - before)]
-            found += _known(wet, group, rows)
+            found += _known_pairs_of(wet, group, rows)
             number += SHARD
     return found
 
@@ -69,7 +69,7 @@ def warped_pairs(
     return found
 
 
-def _known(pair: Pair, group: str, rows: list[int]) -> list[KnownPair]:
+def _known_pairs_of(pair: Pair, group: str, rows: list[int]) -> list[KnownPair]:
     matches = correspondences(pair)
     T_ba = torch.linalg.solve(pair.b.T_wc, pair.a.T_wc).numpy().astype(np.float64)
     return [

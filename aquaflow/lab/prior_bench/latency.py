@@ -58,7 +58,7 @@ def latency_rows(
     jobs = [(contender, size) for size in sizes for contender in contenders]
     for done, (contender, (width, height)) in enumerate(jobs):
         progress("latency", done, len(jobs))
-        for work, spent in _spent(contender.prior, width, height, repeats).items():
+        for work, spent in _measure_latency(contender.prior, width, height, repeats).items():
             rows.append(
                 {
                     "prior": contender.name,
@@ -75,7 +75,7 @@ def latency_rows(
     return rows
 
 
-def _spent(prior: Prior, width: int, height: int, repeats: int) -> dict[str, Spent]:
+def _measure_latency(prior: Prior, width: int, height: int, repeats: int) -> dict[str, Spent]:
     """``tracked``: a frame near its prediction; ``found``: one that moved far, none expected."""
     camera = CameraModel(width, height, float(width), float(width), width / 2, height / 2)
     floor = sea_floor(width, height)
@@ -85,14 +85,14 @@ def _spent(prior: Prior, width: int, height: int, repeats: int) -> dict[str, Spe
     expected = prior.decode(reference, prior.encode(near, camera)).matches
     prior.decode(reference, prior.encode(far, camera))  # what is kept of the reference is there
     return {
-        "tracked": timed(
+        "tracked": measure_time(
             lambda: prior.decode(reference, prior.encode(near, camera), expected), repeats
         ),
-        "found": timed(lambda: prior.decode(reference, prior.encode(far, camera)), repeats),
+        "found": measure_time(lambda: prior.decode(reference, prior.encode(far, camera)), repeats),
     }
 
 
-def timed(work: Callable[[], object], repeats: int) -> Spent:
+def measure_time(work: Callable[[], object], repeats: int) -> Spent:
     """Medians over ``repeats`` calls."""
     wall, cpu = [], []
     for _ in range(max(repeats, LEAST_RUNS)):

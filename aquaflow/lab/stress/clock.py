@@ -18,7 +18,7 @@ HOUR_NS = 3_600_000_000_000
 """Nanoseconds of an hour."""
 
 
-def _clocked(check: Check, seed: int, time_ns: Callable[[int], int]) -> None:
+def _check_clock(check: Check, seed: int, time_ns: Callable[[int], int]) -> None:
     frames = [replace(f, t_ns=time_ns(f.index)) for f in clear_swim(seed)]
     result = track(frames)
     sound(check, frames, result)
@@ -50,22 +50,22 @@ def _written_in_order(check: Check, result: Tracking) -> None:
 @case("time", "dive.folder.DiveFolder.write_trajectory")
 def duplicate_times(check: Check, seed: int) -> None:
     """Every two frames carry the same time."""
-    _clocked(check, seed, lambda i: i // 2 * 100_000_000)
+    _check_clock(check, seed, lambda i: i // 2 * 100_000_000)
 
 
 @case("time", "dive.folder.DiveFolder.write_trajectory")
 def reversed_times(check: Check, seed: int) -> None:
     """The clock runs backwards."""
-    _clocked(check, seed, lambda i: (100 - i) * 100_000_000)
+    _check_clock(check, seed, lambda i: (100 - i) * 100_000_000)
 
 
 @case("time", "dive.folder.DiveFolder.write_trajectory")
 def jumping_times(check: Check, seed: int) -> None:
     """The clock is set while the vehicle dives."""
-    _clocked(check, seed, lambda i: i * 100_000_000 + (HOUR_NS if i % 3 == 1 else 0))
+    _check_clock(check, seed, lambda i: i * 100_000_000 + (HOUR_NS if i % 3 == 1 else 0))
 
 
 @case("time", "dive.folder.DiveFolder.write_trajectory")
 def huge_gaps(check: Check, seed: int) -> None:
     """A year between frames."""
-    _clocked(check, seed, lambda i: i * 24 * 365 * HOUR_NS)
+    _check_clock(check, seed, lambda i: i * 24 * 365 * HOUR_NS)

@@ -48,7 +48,7 @@ def cloud(seed: int, count: int = COUNT) -> RandomGaussians:
     )
 
 
-def _drawn(
+def _check_drawn(
     check: Check,
     gaussians: RandomGaussians,
     culled: Tensor | None = None,  # [N] bool
@@ -89,7 +89,7 @@ def _half() -> Tensor:
     return torch.arange(COUNT) % 2 == 0
 
 
-def _spoiled(seed: int, change: Callable[[RandomGaussians, Tensor], None]) -> RandomGaussians:
+def _spoil(seed: int, change: Callable[[RandomGaussians, Tensor], None]) -> RandomGaussians:
     gaussians = cloud(seed)
     change(gaussians, _half())
     return gaussians
@@ -98,13 +98,13 @@ def _spoiled(seed: int, change: Callable[[RandomGaussians, Tensor], None]) -> Ra
 @case("gaussians", "render.reference.find_sound")
 def zero_scales(check: Check, seed: int) -> None:
     """A scale of exactly zero."""
-    _drawn(check, _spoiled(seed, lambda g, i: g.scales.__setitem__(i, 0.0)), _half())
+    _check_drawn(check, _spoil(seed, lambda g, i: g.scales.__setitem__(i, 0.0)), _half())
 
 
 @case("gaussians", "render.reference.DILATION_PX2")
 def tiny_scales(check: Check, seed: int) -> None:
     """Scales whose squares underflow: the low-pass filter keeps the footprint's determinant."""
-    _drawn(check, _spoiled(seed, lambda g, i: g.scales.__setitem__(i, 1e-25)))
+    _check_drawn(check, _spoil(seed, lambda g, i: g.scales.__setitem__(i, 1e-25)))
 
 
 @case("gaussians", "render.reference.MAX_SIGMA_PX")
@@ -115,7 +115,7 @@ def huge_scales(check: Check, seed: int) -> None:
         g.scales[i] = 1e12
         g.scales[2] = 1e5
 
-    _drawn(check, _spoiled(seed, change), _half())
+    _check_drawn(check, _spoil(seed, change), _half())
 
 
 @case("gaussians", "render.reference.MIN_QUAT_NORM_SQ")
@@ -126,7 +126,7 @@ def zero_and_denormal_quaternions(check: Check, seed: int) -> None:
         g.quats[i] = 0.0
         g.quats[0], g.quats[2] = 1e-40, 1e-13
 
-    _drawn(check, _spoiled(seed, change), _half())
+    _check_drawn(check, _spoil(seed, change), _half())
 
 
 @case("gaussians", "render.reference.MAX_ALPHA")
@@ -137,13 +137,13 @@ def opacity_0_and_1(check: Check, seed: int) -> None:
         g.opacities[:] = 1.0
         g.opacities[i] = 0.0
 
-    _drawn(check, _spoiled(seed, change), _half())
+    _check_drawn(check, _spoil(seed, change), _half())
 
 
 @case("gaussians", "render.reference.NEAR_PLANE_M")
 def behind_the_camera(check: Check, seed: int) -> None:
     """Behind the camera and mirrored into the picture if it is not checked."""
-    _drawn(check, _spoiled(seed, lambda g, i: g.means.__setitem__(i, -g.means[i])), _half())
+    _check_drawn(check, _spoil(seed, lambda g, i: g.means.__setitem__(i, -g.means[i])), _half())
 
 
 @case("gaussians", "render.reference.NEAR_PLANE_M")
@@ -154,7 +154,7 @@ def on_the_camera_centre(check: Check, seed: int) -> None:
         g.means[i] = 0.0
         g.means[2, 2] = 0.01
 
-    _drawn(check, _spoiled(seed, change), _half())
+    _check_drawn(check, _spoil(seed, change), _half())
 
 
 @case("gaussians", "render.reference.find_sound")
@@ -166,27 +166,27 @@ def not_finite(check: Check, seed: int) -> None:
         for n, row in enumerate(torch.nonzero(i)[:, 0].tolist()):
             g.tensors()[n % 5][row] = bad[n % 3]
 
-    _drawn(check, _spoiled(seed, change), _half())
+    _check_drawn(check, _spoil(seed, change), _half())
 
 
 @case("gaussians", "render.contract.check_inputs")
 def no_gaussian(check: Check, seed: int) -> None:
     """An empty map."""
-    _drawn(check, cloud(seed, 0))
+    _check_drawn(check, cloud(seed, 0))
 
 
 @case("gaussians", "render.contract.check_inputs")
 def one_gaussian(check: Check, seed: int) -> None:
     """A map of one."""
-    _drawn(check, cloud(seed, 1))
+    _check_drawn(check, cloud(seed, 1))
 
 
 @case("gaussians", "render.reference.MIN_TRANSMITTANCE")
 def all_identical(check: Check, seed: int) -> None:
     """Every Gaussian in the same place: their order is undefined, transmittance reaches 0."""
     first = cloud(seed, 1)
-    _drawn(check, RandomGaussians(*(tensor.repeat(500, *[1] * (tensor.dim() - 1)) for tensor in
-                          first.tensors())))  # fmt: skip
+    copies = (tensor.repeat(500, *[1] * (tensor.dim() - 1)) for tensor in first.tensors())
+    _check_drawn(check, RandomGaussians(*copies))
 
 
 @case("gaussians", "render.cpu.CpuRenderer", long=True)

@@ -24,7 +24,7 @@ from aquaflow.lab.stress.swim import (
     only_these_lost,
     path,
     sound,
-    spoiled,
+    spoil,
     track,
 )
 from aquaflow.prior.classical import ClassicalPrior
@@ -48,7 +48,7 @@ def _worst_moment(seed: int) -> range:
 def _blind(check: Check, seed: int, change: Callable[[Picture, int], Picture]) -> None:
     """Frames that show nothing get no pose; all others keep theirs, and it is right."""
     hurt = _worst_moment(seed)
-    frames = spoiled(clear_swim(seed), hurt, change)
+    frames = spoil(clear_swim(seed), hurt, change)
     result = track(frames)
     sound(check, frames, result)
     only_these_lost(check, result, hurt, share=0.9)
@@ -67,7 +67,7 @@ def _hard(
     check: Check, seed: int, change: Callable[[Picture, int], Picture], share: float = 0.9
 ) -> None:
     """Pictures that still show the place: ``share`` of the frames are placed, and placed right."""
-    frames = spoiled(clear_swim(seed), range(FRAMES), change)
+    frames = spoil(clear_swim(seed), range(FRAMES), change)
     result = track(frames)
     sound(check, frames, result)
     only_these_lost(check, result, (), share)
@@ -150,7 +150,7 @@ def snow(check: Check, seed: int) -> None:
     """Two seconds of marine snow over two fifths of the picture: it makes no keyframe."""
     camera, poses, snowy = CAMERA.scaled(320, 240), path(34, step_m=0.015), range(8, 28)
     clear = film(Floor(seed), poses, camera)
-    frames = spoiled(clear, snowy, marine_snow(camera, 0.4, seed))
+    frames = spoil(clear, snowy, marine_snow(camera, 0.4, seed))
     result = track(frames)
     sound(check, frames, result)
     only_these_lost(check, result, (), share=0.9)
@@ -166,7 +166,7 @@ def nan_in_float_picture(check: Check, seed: int) -> None:
     floats = frame.image.astype(np.float32) / 255.0
     floats[::7] = np.nan
     wrong = replace(frame, image=floats)  # type: ignore[arg-type]
-    check.true("a float picture is refused", _refused(wrong))
+    check.true("a float picture is refused", _is_refused(wrong))
 
 
 @case("images", "sources.preprocessing.check_picture")
@@ -174,7 +174,7 @@ def one_by_one(check: Check, seed: int) -> None:
     """Pictures of one pixel are refused in one sentence."""
     camera = CameraModel(1, 1, 1.0, 1.0, 0.5, 0.5)
     image = np.full((1, 1, 3), seed % 256, np.uint8)
-    check.true("a picture of one pixel is refused", _refused(Frame(0, 0, 0, image, camera)))
+    check.true("a picture of one pixel is refused", _is_refused(Frame(0, 0, 0, image, camera)))
 
 
 @case("images", "sources.preprocessing.Preparation")
@@ -191,7 +191,7 @@ def width_8192(check: Check, seed: int) -> None:
     only_these_lost(check, result, (), share=0.8)
 
 
-def _refused(frame: Frame) -> bool:
+def _is_refused(frame: Frame) -> bool:
     try:
         Preparation(SourceConfig(), None)(frame)
     except InputError:

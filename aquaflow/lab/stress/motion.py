@@ -121,13 +121,13 @@ def scene_at_infinity(check: Check, seed: int) -> None:
         check.true("the translation is said to be unknown", bool((sigma > 100.0).all()))
 
 
-@case("motion", "tracking.initialisation.bundle._normalised")
+@case("motion", "tracking.initialisation.bundle._normalise")
 def scale_of_a_tenth_millimetre(check: Check, seed: int) -> None:
     """The start is 0.1 mm large; the scale gauge makes it one."""
     _scaled_bundle(check, seed, 1e-4)
 
 
-@case("motion", "tracking.initialisation.bundle._normalised")
+@case("motion", "tracking.initialisation.bundle._normalise")
 def scale_of_100_metres(check: Check, seed: int) -> None:
     """The start is 100 m large; the scale gauge makes it one."""
     _scaled_bundle(check, seed, 1e2)

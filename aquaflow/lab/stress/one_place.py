@@ -81,13 +81,13 @@ class OnePlace:
         return Frame(index, t_ns, t_ns, self._snow(picture, index), self.camera)
 
     def _grey(self, T_wc: Sim3) -> npt.NDArray[np.float32]:
-        u, v = self._met(T_wc)
+        u, v = self._intersect_floor(T_wc)
         wrap = cv2.BORDER_WRAP
         return np.asarray(
             cv2.remap(self._texture, u, v, cv2.INTER_LINEAR, borderMode=wrap), dtype=np.float32
         )
 
-    def _met(self, T_wc: Sim3) -> tuple[npt.NDArray[np.float32], ...]:
+    def _intersect_floor(self, T_wc: Sim3) -> tuple[npt.NDArray[np.float32], ...]:
         """[H, W] each: texel column and row of the floor that a pixel shows."""
         directions = self._rays @ T_wc.R.T.astype(np.float32)
         x, y, z = (float(value) for value in T_wc.t)

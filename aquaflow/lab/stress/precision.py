@@ -108,16 +108,14 @@ def pose_solver_from_float32(check: Check, seed: int) -> None:
     points = VIEW.unproject(pixels) * rng.uniform(0.8, 2.5, (200, 1))
     truth = pose((0.1, 0.05, -0.02), (0.01, 0.03, -0.02))
     seen = VIEW.project(truth.apply(points))
-    exact = _solved(points, seen)
-    rounded = _solved(
-        points.astype(np.float32).astype(float), seen.astype(np.float32).astype(float)
-    )
+    exact = _solve(points, seen)
+    rounded = _solve(points.astype(np.float32).astype(float), seen.astype(np.float32).astype(float))
     size = float(np.linalg.norm(exact.t))
     check.below("pose: relative error", float(np.linalg.norm(rounded.t - exact.t)) / size, 1e-5)
     check.below("pose: error of R", float(np.abs(rounded.R - exact.R).max()), 1e-6)
 
 
-def _solved(
+def _solve(
     points: npt.NDArray[np.float64],  # [N, 3]
     pixels: npt.NDArray[np.float64],  # [N, 2] px
 ) -> Sim3:

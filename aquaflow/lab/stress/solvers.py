@@ -90,7 +90,7 @@ def outliers_95_percent(check: Check, seed: int) -> None:
         check.below("inlier share", estimate.inlier_share, 0.2)
 
 
-@case("solvers", "tracking.initialisation.bundle.measured")
+@case("solvers", "tracking.initialisation.bundle.is_measured")
 def nan_matches_in_bundle(check: Check, seed: int) -> None:
     """One match that is no number costs that match."""
     points = _points(seed)
@@ -159,7 +159,7 @@ def degenerate_two_view(check: Check, seed: int) -> None:
             check.pose("pose", T)
 
 
-@case("solvers", "geometry.alignment._checked")
+@case("solvers", "geometry.alignment._check")
 def degenerate_alignment(check: Check, seed: int) -> None:
     """Points in one place or not finite are refused; points on a line are flagged as collinear."""
     points = _points(seed)

@@ -107,7 +107,7 @@ def clear_swim(seed: int) -> tuple[Frame, ...]:
     return tuple(film(Floor(seed), path()))
 
 
-def spoiled(
+def spoil(
     frames: Sequence[Frame], which: Sequence[int], change: Callable[[Picture, int], Picture]
 ) -> list[Frame]:
     """The clip with the pictures of the frames ``which`` replaced by ``change(picture, index)``."""

@@ -148,7 +148,7 @@ def _medium_is_sound(check: Check, medium: LearnedMedium) -> None:
     water = medium(torch.eye(3))
     total = water.transmission(_ranges()).sum() + water.backscatter(_ranges()).sum()
     total.backward()  # type: ignore[no-untyped-call]
-    check.finite("medium", water.stacked(), total)
+    check.finite("medium", water.stack(), total)
     for name, parameter in medium.named_parameters():
         check.finite(f"medium {name}", parameter, parameter.grad)
     check.true("rates are positive", math.isfinite(float(water.beta_a.detach().log().sum())))

@@ -23,7 +23,7 @@ from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.display import burn_in
 from aquaflow.lab.synthetic.march import RayHeightField
 from aquaflow.lab.synthetic.planted import bleach
-from aquaflow.lab.synthetic.sensor import Snow, expose, quantised, vignette
+from aquaflow.lab.synthetic.sensor import Snow, expose, quantise, vignette
 from aquaflow.lab.synthetic.site import SurveySite, camera_of, site_of
 from aquaflow.lab.synthetic.streams import stream
 from aquaflow.lab.synthetic.telemetry.constants import Constants, draw_constants
@@ -109,10 +109,14 @@ def _write_tables(out: Path, config: SyntheticConfig, site: SurveySite) -> None:
     constants = draw_constants(config)
     sonar = Sonar(site.relief.area, site.crests)
     write_telemetry(out / "telemetry.csv", measure(config, site.motion, sonar, constants))
-    (out / MARKER).write_text(yaml.safe_dump(_stated(config, site, constants), sort_keys=False))
+    (out / MARKER).write_text(
+        yaml.safe_dump(_truth_values(config, site, constants), sort_keys=False)
+    )
 
 
-def _stated(config: SyntheticConfig, site: SurveySite, constants: Constants) -> dict[str, Any]:
+def _truth_values(
+    config: SyntheticConfig, site: SurveySite, constants: Constants
+) -> dict[str, Any]:
     """What synth.yaml says."""
     mountings = site.motion.mountings
     place = mountings.p_bc.tolist()
@@ -186,7 +190,7 @@ def _save(
 ) -> None:
     name = f"{index:06d}"
     _save_png(out / "images" / f"{name}.png", picture)
-    _save_png(out / "clean" / f"{name}.png", quantised(view.clean))
+    _save_png(out / "clean" / f"{name}.png", quantise(view.clean))
     hit = np.isfinite(view.range_m)
     stored = np.where(hit, view.range_m, 0.0).astype(np.float32)
     masks = {"hit": hit, "moving": view.moving} if view.moving.any() else {"hit": hit}

@@ -141,10 +141,10 @@ class RayHeightField:
                     break
                 live, now, stride, ray = live[keep], now[keep], stride[keep], ray[:, keep]
                 at = at if at.dim() == 1 else at[:, keep]
-        t = self._refined(origin, rays, t - last, t)
+        t = self._refine(origin, rays, t - last, t)
         return torch.where(t < max_range, t, torch.inf)
 
-    def _refined(
+    def _refine(
         self,
         origin: torch.Tensor,  # [3] m, or [3, N] of each ray
         rays: torch.Tensor,  # [3, N] unit vectors

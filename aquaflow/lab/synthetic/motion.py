@@ -55,14 +55,14 @@ class TrueBodyMotion:
     ) -> Array:
         """[N, 3] m/s of the body's origin over ground, in the world."""
         swing_b = np.cross(self.rate_b(t), self.mountings.p_bc)
-        return np.asarray(self.path.velocity_w(t) - _turned(self.R_wb(t), swing_b))
+        return np.asarray(self.path.velocity_w(t) - _turn(self.R_wb(t), swing_b))
 
     def velocity_b(
         self,
         t: Array,  # [N] s
     ) -> Array:
         """[N, 3] m/s of the body's origin over ground, in the body frame."""
-        return _turned(np.swapaxes(self.R_wb(t), 1, 2), self.velocity_w(t))
+        return _turn(np.swapaxes(self.R_wb(t), 1, 2), self.velocity_w(t))
 
     def force_b(
         self,
@@ -74,7 +74,7 @@ class TrueBodyMotion:
         """
         before, after = self.velocity_w(t - HALF_STEP_S), self.velocity_w(t + HALF_STEP_S)
         force_w = (after - before) / (2.0 * HALF_STEP_S) - np.array([0.0, 0.0, GRAVITY_M_S2])
-        return _turned(np.swapaxes(self.R_wb(t), 1, 2), force_w)
+        return _turn(np.swapaxes(self.R_wb(t), 1, 2), force_w)
 
     def T_wc(
         self,
@@ -86,7 +86,7 @@ class TrueBodyMotion:
         return T
 
 
-def _turned(
+def _turn(
     R: Array,  # [N, 3, 3]
     vectors: Array,  # [N, 3]
 ) -> Array:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["FloatMap", "blur", "fractal", "resized", "smoothstep"]
+__all__ = ["FloatMap", "blur", "fractal", "resize", "smoothstep"]
 
 FloatMap: TypeAlias = npt.NDArray[np.float32]
 
@@ -35,14 +35,14 @@ def fractal(
         nodes = [max(4, math.ceil(n * cell_m * 2.0 / wavelength) + 3) for n in shape]
         lattice = rng.standard_normal((nodes[0], nodes[1]), dtype=np.float32)
         amplitude = (wavelength / coarsest_m) ** (1.0 - roughness)
-        total += np.float32(amplitude) * resized(lattice, shape)
+        total += np.float32(amplitude) * resize(lattice, shape)
         power += amplitude**2
         wavelength /= 2.0
     # A cubic interpolation of white noise keeps about 0.6 of its variance.
     return total / np.float32(math.sqrt(max(0.6 * power, 1e-12)))
 
 
-def resized(
+def resize(
     values: npt.NDArray[np.float32],  # [h, w] or [h, w, c]
     shape: tuple[int, int],
 ) -> FloatMap:

@@ -78,11 +78,11 @@ def _local(
     R = torch.tensor(shape.R.T, dtype=torch.float32)
     centre = torch.tensor(shape.centre, dtype=torch.float32)
     if origin.dim() == 1:
-        return (R * (origin - centre)).sum(1), _turned(R, rays)
-    return _turned(R, origin - centre[:, None]), _turned(R, rays)
+        return (R * (origin - centre)).sum(1), _turn(R, rays)
+    return _turn(R, origin - centre[:, None]), _turn(R, rays)
 
 
-def _turned(
+def _turn(
     R: torch.Tensor,  # [3, 3]
     vectors: torch.Tensor,  # [3, N]
 ) -> torch.Tensor:
@@ -193,12 +193,12 @@ def radiance(
     footprint = t * pixel * facing.rsqrt() / TEXEL_M
     place = 311.0 * float(shape.centre[0])
     shift = (place if shape.pattern_m is None else shape.pattern_m / TEXEL_M) % TEXELS
-    noise = texture.mirrored(u / TEXEL_M + shift, v / TEXEL_M + 2.0 * shift, footprint)
+    noise = texture.mirror(u / TEXEL_M + shift, v / TEXEL_M + 2.0 * shift, footprint)
     grown = torch.sigmoid(5.0 * (noise[1] + 2.4 * (shape.covered - 0.5)))
     grain = GRAIN if shape.tile_m == 0.0 else GLAZE_GRAIN
     paint = torch.tensor(shape.paint)[:, None] * (1.0 + grain * noise[0])
     if shape.tile_m > 0.0:
-        paint = tiles.laid(paint, texture, u, v, t * pixel * facing.rsqrt(), shape.tile_m)
+        paint = tiles.lay(paint, texture, u, v, t * pixel * facing.rsqrt(), shape.tile_m)
     growth = torch.tensor(shape.growth)[:, None] * (1.0 + 0.28 * noise[0])
     R = torch.tensor(shape.R, dtype=torch.float32)
     up = R[2, 0] * normal[0] + R[2, 1] * normal[1] + R[2, 2] * normal[2]

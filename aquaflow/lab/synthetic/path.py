@@ -105,7 +105,7 @@ def plan_path(
     omega = 2.0 * math.pi * (config.rises or way.rounds) / period
     swing = min(config.altitude_swing_m, MAX_CLIMB_M_S / omega)
     altitude = config.altitude_m + swing * np.cos(omega * at)
-    ground = np.zeros(DENSE + 1) if relief is None else _followed(relief, config, way)
+    ground = np.zeros(DENSE + 1) if relief is None else _height_to_follow(relief, config, way)
     points = np.column_stack([way.points, -(ground + altitude)])
     if way.closed:
         points[-1] = points[0]
@@ -122,7 +122,7 @@ def plan_path(
     return Path(spline, CubicSpline(at, way.heading), tuple(sway), R_ws, t_ws, R_bc)
 
 
-def _followed(
+def _height_to_follow(
     relief: Array,  # [DENSE + 1] m
     config: SyntheticConfig,
     way: Way,

@@ -11,7 +11,7 @@ import numpy as np
 
 from aquaflow.lab.synthetic import hull
 from aquaflow.lab.synthetic.config import SceneKind
-from aquaflow.lab.synthetic.noise import FloatMap, blur, fractal, resized, smoothstep
+from aquaflow.lab.synthetic.noise import FloatMap, blur, fractal, resize, smoothstep
 from aquaflow.lab.synthetic.relief import Relief
 
 __all__ = ["AMBIENT", "SUN", "SUN_DIRECTION", "TEXELS_PER_CELL", "bake"]
@@ -51,7 +51,7 @@ def bake(
     np.clip(colour, 0.004, 0.98, out=colour)
     dy, dx = np.gradient(relief.height, relief.area.cell)
     steep = smoothstep(np.hypot(dx, dy).astype(np.float32), 0.7, 1.7)
-    steep = np.clip(resized(steep, shape), 0.0, 1.0)[..., None]
+    steep = np.clip(resize(steep, shape), 0.0, 1.0)[..., None]
     # On a steep face the few pixels of the map would be stretched to stripes.
     colour += np.float32(0.8) * steep * (blur(colour, 0.02 / texel) - colour)
     return np.concatenate([colour, steep], axis=-1)
@@ -67,13 +67,13 @@ def _albedo(
 ) -> FloatMap:
     if kind == "hull":
         return hull.painted_plates(relief.area, shape, texel, rng)
-    cover = np.clip(resized(relief.cover, shape), 0.0, 1.0)
+    cover = np.clip(resize(relief.cover, shape), 0.0, 1.0)
     broad = fractal(rng, shape, texel, 3.0, 0.0, 0.72)
     spots = fractal(rng, shape, texel, 0.20, 0.0, 0.85)
     sand = np.array([0.60, 0.53, 0.42], np.float32) * (1.0 + 0.10 * broad + 0.14 * micro)[..., None]
     _mix(sand, smoothstep(spots, 1.1, 1.7), (0.88, 0.85, 0.78), 0.8)
     _mix(sand, smoothstep(-spots, 1.1, 1.7), (0.16, 0.14, 0.12), 0.8)
-    rock = resized(relief.tint, shape) * (1.0 + 0.22 * broad + 0.24 * micro)[..., None]
+    rock = resize(relief.tint, shape) * (1.0 + 0.22 * broad + 0.24 * micro)[..., None]
     algae = fractal(rng, shape, texel, 0.8, 0.0, 0.6)
     _mix(rock, smoothstep(algae, 0.2, 0.9), (0.30, 0.33, 0.15), 0.55)
     _mix(rock, smoothstep(-algae + 0.5 * broad, 0.7, 1.2), (0.58, 0.34, 0.38), 0.65)
@@ -105,8 +105,8 @@ def _light(
     texel: float,
 ) -> FloatMap:
     """Light [2 H, 2 W] that reaches the ground, from normals, hollows and shadows."""
-    cover = np.clip(resized(relief.cover, shape), 0.0, 1.0)
-    height = resized(relief.height, shape) + (0.0006 + 0.0016 * cover) * micro
+    cover = np.clip(resize(relief.cover, shape), 0.0, 1.0)
+    height = resize(relief.height, shape) + (0.0006 + 0.0016 * cover) * micro
     dy, dx = np.gradient(height, texel)
     norm = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
     sx, sy, sz = (np.float32(v) for v in SUN_DIRECTION)
@@ -114,8 +114,8 @@ def _light(
     coarse = _openness(casters, relief.area.cell)
     shadow = _sunlit(casters, relief.area.cell)
     fine = np.clip(1.0 + (height - blur(height, 0.012 / texel)) / 0.012, 0.55, 1.25)
-    ambient = AMBIENT * resized(coarse, shape) * fine * (0.6 + 0.4 * norm)
-    return np.asarray(ambient + SUN * facing * np.clip(resized(shadow, shape), 0, 1), np.float32)
+    ambient = AMBIENT * resize(coarse, shape) * fine * (0.6 + 0.4 * norm)
+    return np.asarray(ambient + SUN * facing * np.clip(resize(shadow, shape), 0, 1), np.float32)
 
 
 def _openness(

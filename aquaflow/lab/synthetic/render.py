@@ -209,7 +209,7 @@ def _trace(
     J = scene.floor.sample((x - scene.area.x0) / texel, (y - scene.area.y0) / texel, footprint)
     J, steep = J[:3], J[3]
     which = ((steep > 0.05) & (what < 0)).nonzero()[:, 0]
-    z = _picked(origin, which)[2] + near[which] * rays[2, which]
+    z = _pick(origin, which)[2] + near[which] * rays[2, which]
     J[:, which] *= 1.0 + steep[which] * _grain(scene, x[which], y[which], z, near[which] * pixel)
     for index in np.unique(what.numpy()).tolist():
         if index < 0:
@@ -218,7 +218,7 @@ def _trace(
         J[:, which] = objects.radiance(
             scene.shapes[index],
             scene.object_texture,
-            _picked(origin, which),
+            _pick(origin, which),
             rays[:, which],
             t[which],
             pixel,
@@ -227,7 +227,7 @@ def _trace(
     return t, what, J.reshape(3, *shape).permute(1, 2, 0).numpy()
 
 
-def _picked(
+def _pick(
     origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     which: torch.Tensor,  # [M] rays
 ) -> torch.Tensor:
@@ -245,7 +245,7 @@ def _grain(
     """Relative change [N] of the radiance on steep faces; ``size`` (m) is the ray's footprint."""
     texel = objects.TEXEL_M
     u, v = (0.8 * x + 0.6 * y) / texel, (z + 0.5 * (0.8 * y - 0.6 * x)) / texel
-    grain, patches = scene.object_texture.mirrored(u, v, size / texel)
+    grain, patches = scene.object_texture.mirror(u, v, size / texel)
     change: torch.Tensor = (0.32 * grain + 0.22 * patches).clamp(-0.75, 0.9)
     return change
 

@@ -12,7 +12,7 @@ from aquaflow.geometry.optics import pixels_of_points
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.water import Medium
 
-__all__ = ["Snow", "expose", "quantised", "vignette"]
+__all__ = ["Snow", "expose", "quantise", "vignette"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Image: TypeAlias = npt.NDArray[np.float32]
@@ -112,10 +112,10 @@ def expose(
     image = water * shade[..., None]
     if sigma > 0.0:
         image += np.float32(sigma) * rng.standard_normal(image.shape, dtype=np.float32)
-    return quantised(image)
+    return quantise(image)
 
 
-def quantised(
+def quantise(
     image: Image,  # [H, W, 3]
 ) -> npt.NDArray[np.uint8]:
     """Radiance in [0, 1] as 0 to 255, linear, clipped."""

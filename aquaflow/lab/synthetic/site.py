@@ -74,7 +74,7 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> SurveySite:
     """
     home = config.home
     around = way_of(home).points
-    low, high = _seen(home, paths.plan_path(home, stream(home.seed, "sway")))
+    low, high = _seen_area(home, paths.plan_path(home, stream(home.seed, "sway")))
     low, high = low - (home.margin_m or 0.0), high + (home.margin_m or 0.0)
     texel = max(
         TEXEL_PX * (home.altitude_m - 0.2) / home.focal_px,
@@ -92,7 +92,7 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> SurveySite:
     return SurveySite(relief, shapes, objects.casters(relief, shapes), path, motion)
 
 
-def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
+def _seen_area(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
     """Corners [2] (m, survey frame) of the floor that the dive sees."""
     if config.scene == "pool":
         return pool.corners(way_of(config).points)

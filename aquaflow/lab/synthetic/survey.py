@@ -21,7 +21,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.lab.synthetic.config import WaterType
-from aquaflow.lab.synthetic.sensor import quantised
+from aquaflow.lab.synthetic.sensor import quantise
 from aquaflow.lab.synthetic.water import WATER_TYPES
 from aquaflow.types import Frame
 
@@ -84,24 +84,26 @@ class _Noise:
         """[H, W] at ``x`` and ``y``, all of which lie in ``box``."""
         first = [int(np.floor(low / self.spacing_m)) - MARGIN for low in box[:2]]
         last = [int(np.ceil(high / self.spacing_m)) + MARGIN for high in box[2:]]
-        lattice = _hashed(np.arange(first[0], last[0]), np.arange(first[1], last[1]), self.seed)
+        lattice = _hash_lattice(
+            np.arange(first[0], last[0]), np.arange(first[1], last[1]), self.seed
+        )
         column = (x / np.float32(self.spacing_m)) - np.float32(first[0])
         row = (y / np.float32(self.spacing_m)) - np.float32(first[1])
         return np.asarray(cv2.remap(lattice, column, row, cv2.INTER_CUBIC), np.float32)
 
 
-def _hashed(
+def _hash_lattice(
     columns: npt.NDArray[np.int64],  # [W]
     rows: npt.NDArray[np.int64],  # [H]
     seed: int,
 ) -> Map:
     """[H, W] in [-1, 1): a mixed-up number for every place of a lattice."""
-    across = _mixed(columns.astype(np.uint32) ^ np.uint32(seed * 0x9E3779B9 & 0xFFFFFFFF))
-    mixed = _mixed(across[None, :] ^ _mixed(rows.astype(np.uint32))[:, None])
+    across = _mix(columns.astype(np.uint32) ^ np.uint32(seed * 0x9E3779B9 & 0xFFFFFFFF))
+    mixed = _mix(across[None, :] ^ _mix(rows.astype(np.uint32))[:, None])
     return mixed.astype(np.float32) * np.float32(2.0**-31) - np.float32(1.0)
 
 
-def _mixed(
+def _mix(
     x: Lattice,  # [...]
 ) -> Lattice:
     """[...] a bijection of 32 bits in which every bit of ``x`` changes half of the others: Chris
@@ -154,7 +156,7 @@ class SurveyPictures:
         return Sim3(turn, np.array([x, y, 0.0]) + sway[:3] * SWAY_M)
 
     def _picture(self, index: int) -> npt.NDArray[np.uint8]:
-        x, y, ahead, box = self._met(self.T_wc(index))
+        x, y, ahead, box = self._intersect_seabed(self.T_wc(index))
         brightness = _sum(self._texture, x, y, box)
         tint = _sum(self._tint, x, y, box)
         log_colours = np.stack([brightness + tint, brightness, brightness - tint], axis=-1)
@@ -162,9 +164,9 @@ class SurveyPictures:
         seen = self._water.compose(radiance, ahead * self._length).astype(np.float32)
         rng = np.random.default_rng([self._seed, index])
         seen += np.float32(NOISE) * rng.standard_normal(seen.shape, np.float32)
-        return quantised(seen)
+        return quantise(seen)
 
-    def _met(self, T_wc: Sim3) -> tuple[Map, Map, Map, Box]:
+    def _intersect_seabed(self, T_wc: Sim3) -> tuple[Map, Map, Map, Box]:
         """[H, W] each: x and y in m of where a pixel's ray meets the seabed, and how many of its
         lengths that is away; and a box around all of these places."""
         along_x, along_y, down = np.moveaxis(self._rays @ T_wc.R.T.astype(np.float32), -1, 0)

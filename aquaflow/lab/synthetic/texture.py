@@ -52,7 +52,7 @@ class MipAtlas:
         fine = self._level(u, v, lower)
         return fine + (self._level(u, v, lower + 1.0) - fine) * share
 
-    def mirrored(
+    def mirror(
         self,
         u: torch.Tensor,  # [N] texels
         v: torch.Tensor,  # [N] texels

@@ -6,7 +6,7 @@ import torch
 
 from aquaflow.lab.synthetic.texture import MipAtlas
 
-__all__ = ["laid"]
+__all__ = ["lay"]
 
 JOINT_SHARE = 0.05
 """Width of a joint over the edge of a tile."""
@@ -18,7 +18,7 @@ APART = (67.3, 41.9)
 """Texels between what neighbouring tiles read of the texture, so that their tints differ."""
 
 
-def laid(
+def lay(
     paint: torch.Tensor,  # [3, N] albedo of the glaze
     texture: MipAtlas,  # noise of unit variance in its first channel
     u: torch.Tensor,  # [N] m on the surface
@@ -28,7 +28,7 @@ def laid(
 ) -> torch.Tensor:
     """Albedo [3, N] of a surface with tiles."""
     column, row = torch.floor(u / edge_m), torch.floor(v / edge_m)
-    tint = texture.mirrored(APART[0] * column, APART[1] * row, torch.ones_like(u))[0]
+    tint = texture.mirror(APART[0] * column, APART[1] * row, torch.ones_like(u))[0]
     # Beyond a tile's size the tints average out.
     tint = TINT * tint * (edge_m / footprint.clamp_min(edge_m))
     joint = 1.0 - (1.0 - _joint(u, footprint, edge_m)) * (1.0 - _joint(v, footprint, edge_m))

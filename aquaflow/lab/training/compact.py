@@ -23,7 +23,7 @@ from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
 from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE
-from aquaflow.lab.training.pairs import Pair, joined
+from aquaflow.lab.training.pairs import Pair, join
 from aquaflow.prior.compact.matching import descriptors_at, window_products
 from aquaflow.prior.compact.network import (
     COARSE,
@@ -112,8 +112,8 @@ class CompactTask:
             parts.append(maps.pairs(draw, mapped))
         if self.real is not None:
             parts.append(self.real.pairs(draw, real))
-        clear = joined(parts)
-        conditions = settings.conditions.scaled(min(step / max(settings.calm_steps, 1), 1.0))
+        clear = join(parts)
+        conditions = settings.conditions.scale(min(step / max(settings.calm_steps, 1), 1.0))
         pair = training_pair(draw, clear, self.looks_at(step), conditions)
         ranged = torch.arange(settings.batch, device=self.device) < settings.batch - real
         terms = compact_losses(self.network, pair, settings, draw, ranged)

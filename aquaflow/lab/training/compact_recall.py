@@ -78,10 +78,10 @@ def tracked_recall(
         images = (pair.a.image, pair.b.image)
         encoded = None if encode is None else [encode(image) for image in images]
         starts = _coarse_starts(encoded, pair)
-        expected = _moved(here, starts)
+        expected = _move_pixels(here, starts)
         greys = [[_grey(picture) for picture in image] for image in images]
         flows = [_flow(matcher, *g) for g in zip(*greys, starts, strict=True)]
-        places = {"smooth_8px": expected, "flow_2px": _moved(here, flows)}
+        places = {"smooth_8px": expected, "flow_2px": _move_pixels(here, flows)}
         if encoded is not None:
             places["smooth_fine_2px"], _ = fine_around(encoded[0].D, encoded[1].D, here, expected)
         for name, pixels in places.items():
@@ -163,7 +163,7 @@ def _flow(
     return matcher(a, b, dense.texture(a), dense.texture(b), start).forward
 
 
-def _moved(
+def _move_pixels(
     here: Tensor,  # [B, N, 2] px
     flows: Sequence[dense.Float | None],  # [H, W, 2] px; None moves nothing
 ) -> Tensor:

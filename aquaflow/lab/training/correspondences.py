@@ -67,7 +67,7 @@ def nearest_pixels(
 def overlap(pair: Pair) -> Tensor:
     """[B] share of the valid pixels that the other view sees, the smaller of both directions."""
     shares = []
-    for way in (pair, pair.swapped()):
+    for way in (pair, pair.swap()):
         seen = correspondences(way).visible.flatten(1).sum(1)
         shares.append(seen / way.a.valid.flatten(1).sum(1).clamp_min(1))
     return torch.minimum(*shares)

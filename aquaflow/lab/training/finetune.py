@@ -19,7 +19,7 @@ from torch import Tensor
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.lab.training.datasets.chaining import chained
+from aquaflow.lab.training.datasets.chaining import chain
 from aquaflow.lab.training.datasets.colmap import colmap
 from aquaflow.lab.training.datasets.mimir import mimir
 from aquaflow.lab.training.datasets.posed import Frames, Posed, nothing_in, read_image
@@ -57,7 +57,7 @@ def flsea(root: Path) -> list[Frames]:
     stretches = []
     for folder in folders:
         frames = _dive(folder, root, camera)
-        stretches += chained(frames)
+        stretches += chain(frames)
     return stretches
 
 
@@ -244,7 +244,7 @@ def read_data(specs: Sequence[str]) -> list[Frames]:
     return sequences
 
 
-def mined(
+def mine_pairs(
     sequences: Sequence[Frames],
     out: Path,
     settings: FineTuningSettings,

@@ -16,7 +16,7 @@ from aquaflow.lab.training.pair_generator.drawing import WindowVariation, throug
 from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.scene import Detail
-from aquaflow.lab.training.pair_generator.sensor import taken
+from aquaflow.lab.training.pair_generator.sensor import take_picture
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
 from aquaflow.lab.training.pairs import Pair
 
@@ -50,7 +50,7 @@ SETS = {
     "wide": HeldOutSet("held_out", WIDE),
     "wider": HeldOutSet("held_out_wider", WIDER),
     "hard": HeldOutSet(
-        "held_out_hard", TRAINING, Detail(regular=0.3), Conditions().scaled(2.0), SEED + 1
+        "held_out_hard", TRAINING, Detail(regular=0.3), Conditions().scale(2.0), SEED + 1
     ),
 }
 """Those that figures are given for; ``hard`` has all that a training has, twice as often."""
@@ -85,6 +85,6 @@ def turned_pictures(folders: Sequence[Path], count: int = COUNT) -> list[Pair]:
     pairs = []
     for _ in range(0, count, TOGETHER):
         pair = windows(draw, pictures.pairs(draw, TOGETHER), REAL_WINDOWS)
-        a, b = (replace(view, image=taken(draw, view.image)) for view in (pair.a, pair.b))
+        a, b = (replace(view, image=take_picture(draw, view.image)) for view in (pair.a, pair.b))
         pairs.append(Pair(a, b))
     return pairs

@@ -22,7 +22,7 @@ class LossWeights:
     """Weights of the terms; defaults of fine-tuning (docs/paper.md#published-values)."""
 
     beta: float = 0.075
-    """Of the matching term; from scratch it must dominate (docs/measurements.md#compact-prior)."""
+    """Of the matching term; from scratch it must dominate (notes/measurements.md#compact-prior)."""
     points_alpha: float = 0.2
     """Reward of the logarithm of the points' confidence."""
     match_alpha: float = 10.0
@@ -96,7 +96,7 @@ def match_loss(
     rows, columns = nearest_pixels(found.pixels, pair.b)
     losses = []
     for item in range(len(rows)):
-        places = _drawn(found.visible[item], weights.matches, generator)
+        places = _draw(found.visible[item], weights.matches, generator)
         if len(places) < 2:  # nothing to distinguish
             continue
         v, u = places.unbind(1)
@@ -128,7 +128,7 @@ def info_nce(
     return (trust * (both[0] + both[1]) / 2 - alpha * trust.log()).mean()
 
 
-def _drawn(
+def _draw(
     visible: Tensor,  # [H, W] bool
     count: int,
     generator: torch.Generator,

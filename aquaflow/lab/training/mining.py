@@ -126,7 +126,7 @@ class MinedPairs:
         T_aw = np.linalg.inv(first.T_wc)
         a = self._view(first, T_aw)
         b = self._view(second, T_aw)
-        return Pair(_without(a, moved(a, b)), _without(b, moved(b, a)))
+        return Pair(_without(a, is_moved(a, b)), _without(b, is_moved(b, a)))
 
     def _view(
         self,
@@ -233,10 +233,10 @@ THROUGH = 0.1
 def valid_pixels(posed: Posed) -> Mask:
     """[H, W] of one picture alone: depth is known, no highlight, not lost in the veil."""
     known = np.isfinite(posed.depth) & (posed.depth > NEAR_M) & (posed.depth < FAR_M)
-    return known & ~_highlights(posed.image) & ~_veiled(posed.image)
+    return known & ~_highlights(posed.image) & ~_veil(posed.image)
 
 
-def moved(a: ViewBatch, b: ViewBatch) -> Tensor:
+def is_moved(a: ViewBatch, b: ViewBatch) -> Tensor:
     """[B, H, W] bool: a's point would hide what b sees there, so it was elsewhere by then."""
     points = seen_from(b.T_wc, a.points(), a.T_wc)
     pixels, inside = project(points, b)
@@ -255,7 +255,7 @@ def _highlights(
     return np.asarray(cv2.dilate(bright, np.ones((side, side), np.uint8)) > 0)
 
 
-def _veiled(
+def _veil(
     image: npt.NDArray[np.uint8],  # [H, W, 3]
 ) -> Mask:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)

@@ -56,7 +56,7 @@ class Pair:
     a: ViewBatch
     b: ViewBatch
 
-    def swapped(self) -> Pair:
+    def swap(self) -> Pair:
         """The same pair, seen from b."""
         return Pair(self.b, self.a)
 
@@ -65,7 +65,7 @@ class Pair:
         return Pair(self.a.to(device), self.b.to(device))
 
 
-def joined(pairs: Sequence[Pair]) -> Pair:
+def join(pairs: Sequence[Pair]) -> Pair:
     """One batch of several, of pictures of one size."""
     return Pair(joined_views([pair.a for pair in pairs]), joined_views([pair.b for pair in pairs]))
 

@@ -99,7 +99,7 @@ def train(
     optimiser = torch.optim.AdamW(
         task.network.parameters(), lr=0.0, betas=plan.betas, weight_decay=plan.weight_decay
     )
-    run = _resumed(task.network, optimiser, out / CHECKPOINT)
+    run = _resume(task.network, optimiser, out / CHECKPOINT)
     began, steps = time.process_time() - run.cpu_s, plan.schedule.steps
     sums: dict[str, list[float]] = {}
     until = math.inf if plan.hours is None else time.monotonic() + 3600.0 * plan.hours
@@ -178,7 +178,7 @@ def _save(network: nn.Module, optimiser: torch.optim.Optimizer, run: _Run, path:
         torch.save(state, stream)
 
 
-def _resumed(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) -> _Run:
+def _resume(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) -> _Run:
     if not path.is_file():
         return _Run(0, 0.0, [])
     try:

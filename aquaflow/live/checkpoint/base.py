@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.errors import InputError
-from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed, to_sim3, under
+from aquaflow.geometry.arrays import Arrays, add_prefix, of_sim3, to_sim3, under
 from aquaflow.keyframes.place import KeypointDepths
 from aquaflow.live.checkpoint.generations import Checkpoint
 from aquaflow.slam import Slam
@@ -66,7 +66,7 @@ def serialise(in_base: InBase) -> tuple[dict[str, Any], Arrays]:
         "poses": of_sim3([link.T_sk for link in links]),
         "covariances": np.array([link.covariance for link in links]).reshape(-1, 7, 7),
     }
-    return facts, prefixed("in_site", arrays)
+    return facts, add_prefix("in_site", arrays)
 
 
 def restore(

@@ -20,7 +20,7 @@ from aquaflow import __version__
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
 from aquaflow.dive.run import DiveRun
-from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed, to_sim3, under
+from aquaflow.geometry.arrays import Arrays, add_prefix, of_sim3, to_sim3, under
 from aquaflow.live.checkpoint import tracking
 from aquaflow.live.checkpoint.generations import (
     FORMAT,
@@ -98,12 +98,12 @@ class Checkpointer:
             try:
                 files = self._slam.keyframes.save()
             except OSError as error:  # what it would name is not there
-                self._failed(error)
+                self._record_failure(error)
                 return
         moment = replace(ClockReading.now(), dive_shift_ns=self._shift_ns())
         head = {"format": FORMAT, "version": __version__, "moment": moment.to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
-        arrays = prefixed("tracking", arrays)
+        arrays = add_prefix("tracking", arrays)
 
         def write(maps: OwnedMaps, lacking: list[MapCorrection]) -> None:
             self._write(maps, lacking, head, arrays, files)
@@ -126,16 +126,16 @@ class Checkpointer:
             facts["lacking"], more = serialise_corrections(lacking)
             own |= more
             bring_to_disk([*files, self._dive / TELEMETRY, *maps.save_pictures()])
-            write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
+            write_state(self._dive, head | {"mapping": facts}, arrays | add_prefix("mapping", own))
             self.taken += 1
             self.size_bytes = state_file(self._dive).stat().st_size
         except (InputError, OSError) as error:
-            self._failed(error)
+            self._record_failure(error)
         finally:
             self.wrote_s = time.monotonic() - began
             self._writing = False
 
-    def _failed(self, error: Exception) -> None:
+    def _record_failure(self, error: Exception) -> None:
         """Count a failed write; the previous checkpoint stays usable."""
         self.failures += 1
         log.warning("no checkpoint: %s", error)

@@ -100,13 +100,13 @@ def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: OwnedMaps) -
     if keyframes:
         hang = sum(tracked.keyframe in keyframes for tracked in slam.results())
         said.append(
-            f"the files of {_named('keyframe', keyframes)} were damaged or gone: their {hang} "
+            f"the files of {_name_lost('keyframe', keyframes)} were damaged or gone: their {hang} "
             "frames keep their poses, but these places are no longer recognised"
         )
     lost = maps.lost_pictures
     if lost:
         said.append(
-            f"the pictures of {_named('mapped frame', lost)} were damaged or gone: the "
+            f"the pictures of {_name_lost('mapped frame', lost)} were damaged or gone: the "
             "map goes on without them"
         )
     return said
@@ -157,7 +157,7 @@ def _row_losses(rows: RepairedRows, path: Path) -> list[str]:
     ]
 
 
-def _named(kind: str, numbers: Iterable[int]) -> str:
+def _name_lost(kind: str, numbers: Iterable[int]) -> str:
     ordered = sorted(numbers)
     listed = ", ".join(map(str, ordered[:MOST_NAMED]))
     more = "" if len(ordered) <= MOST_NAMED else f" and {len(ordered) - MOST_NAMED} more"
@@ -194,7 +194,7 @@ def salvaged_rows(
         found, unreadable = readable_rows(path)
     except OSError:
         found, unreadable = [], 0
-    known = {row.index: row for row in _known(checkpoint, name_of)}
+    known = {row.index: row for row in _known_rows(checkpoint, name_of)}
     newest = max(known, default=-1)
     named = any(row.index == newest and row.source == known[newest].source for row in found)
     rows: list[FrameRow] = []
@@ -218,7 +218,7 @@ def _agree(row: FrameRow, true: FrameRow) -> bool:
     return replace(row, sub_map=None).cells()[2:7] == replace(true, sub_map=None).cells()[2:7]
 
 
-def _known(checkpoint: Checkpoint, name_of: Callable[[int], str]) -> list[FrameRow]:
+def _known_rows(checkpoint: Checkpoint, name_of: Callable[[int], str]) -> list[FrameRow]:
     """Rows of the frames that the checkpoint knows."""
     camera = to_camera(checkpoint.facts["tracking"]["camera"])
     rows = []

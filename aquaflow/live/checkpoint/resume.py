@@ -52,7 +52,7 @@ def choose(
     A dive without a usable checkpoint, one that is too old, and one whose age is not known are left
     unchanged; a new folder is used. ``is_set``: whether the wall clock can be believed.
     """
-    folder = None if new else next(iter(_unfinished(dives, now.boot)), None)
+    folder = None if new else next(iter(_unfinished_folders(dives, now.boot)), None)
     checkpoint = None if folder is None else newest_usable(folder)
     if folder is None or checkpoint is None:  # an older one was left for this one
         return Choice(_fresh(dives))
@@ -63,14 +63,14 @@ def choose(
     return Choice(_fresh(dives), notes=(note,), left=folder)
 
 
-def resumed(folder: Path, new: bool) -> Choice:
+def resume_folder(folder: Path, new: bool) -> Choice:
     """A folder given by name: resumed if possible.
 
     If not, and with ``new``, the dive goes into the first of ``folder``, ``folder-2``, ... that
     holds no rows of another; on the way, without ``new``, one that can be resumed is.
     """
     taken = holds_rows if new else _was_cut_off
-    for place in _numbered(folder):
+    for place in _numbered_folders(folder):
         checkpoint = None if new else newest_usable(place)
         if checkpoint is not None or not taken(place):
             break
@@ -92,7 +92,7 @@ def holds_rows(folder: Path) -> bool:
     """True if the folder holds recorded rows, even damaged ones."""
     frames = folder / MARKER
     recorded = frames.is_file() and frames.stat().st_size > len(header())
-    return recorded or (folder / "metrics.json").is_file() or bool(_kept(folder))
+    return recorded or (folder / "metrics.json").is_file() or bool(_kept_files(folder))
 
 
 def newest_usable(folder: Path) -> Checkpoint | None:
@@ -124,22 +124,22 @@ def _is_complete(dive: Path) -> bool:
 def _was_cut_off(folder: Path) -> bool:
     """True if the folder holds recorded rows of a dive that was not finished."""
     replayed = not (folder / STATUS).exists() and (folder / "metrics.json").is_file()
-    ended = (replayed or _is_complete(folder)) and not _kept(folder)
+    ended = (replayed or _is_complete(folder)) and not _kept_files(folder)
     return holds_rows(folder) and not ended
 
 
-def _kept(folder: Path) -> list[Path]:
+def _kept_files(folder: Path) -> list[Path]:
     """The files that a run kept for a resumption."""
     return [path for name in (CHECKPOINT, WORK) for path in (folder / name).glob("**/*.*")]
 
 
-def _numbered(folder: Path) -> Iterator[Path]:
+def _numbered_folders(folder: Path) -> Iterator[Path]:
     yield folder
     for count in itertools.count(2):
         yield folder.with_name(f"{folder.name}-{count}")
 
 
-def _unfinished(dives: Path, boot: str) -> list[Path]:
+def _unfinished_folders(dives: Path, boot: str) -> list[Path]:
     """Folders with a checkpoint that no process holds. Those that ran under this ``boot`` come
     first, whatever the wall clock was when they did; then the newest."""
     newest: dict[Path, tuple[bool, float]] = {}
@@ -180,7 +180,7 @@ def _why_left(
 def _fresh(dives: Path) -> Path:
     """Named by the wall clock, which may stand still over a restart."""
     named = dives / time.strftime("dive-%Y%m%d-%H%M%S")
-    return next(folder for folder in _numbered(named) if not folder.exists())
+    return next(folder for folder in _numbered_folders(named) if not folder.exists())
 
 
 # --------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ class SetAside:
         try:
             path.replace(self._place(path, why))
         except OSError as error:
-            raise _refused(path, error) from error
+            raise _refusal(path, error) from error
 
     def copy(self, path: Path, why: str) -> None:
         """Keep a file as it is now, if it is there: it will be written anew.
@@ -48,7 +48,7 @@ class SetAside:
             with open_regular(path, depth) as stream, atomic_write(self._place(path, why)) as copy:
                 shutil.copyfileobj(stream, copy)
         except OSError as error:
-            raise _refused(path, error) from error
+            raise _refusal(path, error) from error
 
     def _place(self, path: Path, why: str) -> Path:
         if self._folder is None:
@@ -64,6 +64,6 @@ class SetAside:
         return place
 
 
-def _refused(path: Path, error: OSError) -> InputError:
+def _refusal(path: Path, error: OSError) -> InputError:
     reason = error.strerror or str(error)
     return InputError(f"cannot set {path} aside: {reason}; give the dive's folder room and rights")

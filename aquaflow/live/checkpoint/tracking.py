@@ -13,9 +13,9 @@ from aquaflow.dive.run import DiveRun
 from aquaflow.geometry.arrays import (
     Arrays,
     Cameras,
+    add_prefix,
     of_camera,
     of_sim3,
-    prefixed,
     to_camera,
     to_sim3,
     under,
@@ -49,7 +49,7 @@ def serialise(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None:
         "skipped": dict(slam.skipped),
         "cameras": cameras.to_json(),
         "first_pose_s": run.first_pose_s,
-        "source": _asked(slam.config),
+        "source": _size_settings(slam.config),
         "notes": list(run.notes),
         "lost_keyframes": sorted(slam.keyframes.lost),
     }
@@ -61,7 +61,7 @@ def serialise(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None:
         "frames": slam.frames.rows(),
         "keyframes": np.array(rows, np.int64).reshape(-1, 5),
         "poses": of_sim3([keyframe.T_wc for keyframe in keyframes]),
-        **prefixed("graph", dict(slam.graph.graph.tables())),
+        **add_prefix("graph", dict(slam.graph.graph.tables())),
     }
     return facts, arrays
 
@@ -115,7 +115,7 @@ def refuse_another_size(dive: Path, facts: dict[str, Any], config: Config) -> No
     Raises:
         ConfigError: ``config`` asks for pictures of another width, or cropped in another way.
     """
-    asked = _asked(config)
+    asked = _size_settings(config)
     for name, before in facts["source"].items():
         if asked[name] != before:
             was, now = (value or "the default" for value in (before, asked[name]))
@@ -125,6 +125,6 @@ def refuse_another_size(dive: Path, facts: dict[str, Any], config: Config) -> No
             )
 
 
-def _asked(config: Config) -> dict[str, Any]:
+def _size_settings(config: Config) -> dict[str, Any]:
     """The settings that determine the size of the mapped pictures."""
     return {"width": config.source.width, "crop": config.source.crop}

@@ -14,7 +14,7 @@ from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
 from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, taken, water_status
+from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, take_map_moment, water_status
 from aquaflow.live.foxglove.server import FoxgloveServer
 from aquaflow.live.report import GOOD
 from aquaflow.mapping.work import OwnedMaps
@@ -88,9 +88,9 @@ class LiveFoxglove(DiveView):
             self._pose_s, self._last = now, latest.frame.index
             self._hand_over(dive, latest, t_ns, frame)
         if now - self._map_s >= self._config.refresh_s and not self._asked:
-            points = self._server.wanted(topics.POINTS)
-            drawn = any(map(self._server.wanted, PICTURES))
-            if points or drawn or self._server.wanted(topics.DIAGNOSTICS):
+            points = self._server.is_wanted(topics.POINTS)
+            drawn = any(map(self._server.is_wanted, PICTURES))
+            if points or drawn or self._server.is_wanted(topics.DIAGNOSTICS):
                 self._map_s, self._asked = now, True
                 sub_map = latest.sub_map
                 dive.maps.inspect(
@@ -119,7 +119,7 @@ class LiveFoxglove(DiveView):
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            self._maps.put(taken(mapper, sub_map, frame, points, drawn))
+            self._maps.put(take_map_moment(mapper, sub_map, frame, points, drawn))
 
     # --- in the thread of its own -----------------------------------------------------------------
 
@@ -160,13 +160,13 @@ class LiveFoxglove(DiveView):
 
     def _show_path(self, t_ns: int, sub_map: int, frame: WorldFrame, tree: FrameTree) -> None:
         """All poses so far, where the dive's metric frame, which changes, has them now."""
-        if self._server.wanted(topics.PATH):
+        if self._server.is_wanted(topics.PATH):
             own = [(at_ns, T) for at_ns, number, T in self._path if number == sub_map]
             poses = [(at_ns, tree.moving(frame.pose(T)).T) for at_ns, T in own]
             self._server.send(topics.PATH, t_ns, messages.path(t_ns, MAP, poses))
 
     def _show_picture(self, moment: _PosedMessage) -> None:
-        if moment.picture is None or not self._server.wanted(topics.CAMERA):
+        if moment.picture is None or not self._server.is_wanted(topics.CAMERA):
             return
         t_ns, prepared = moment.t_ns, moment.preparation(moment.picture)
         self._server.send(topics.CAMERA, t_ns, messages.jpeg(t_ns, OPTICAL, prepared.image))

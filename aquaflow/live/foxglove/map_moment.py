@@ -15,7 +15,7 @@ from aquaflow.dive.point_cloud import PointCloud
 from aquaflow.dive.posed_views import PosedView, posed_views
 from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
-from aquaflow.mapping.map_copy import MapCopy, copied
+from aquaflow.mapping.map_copy import MapCopy, copy_map
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import common_exposure, drawn_without_water, to_bytes
 from aquaflow.render.transfers import picture_out
@@ -46,7 +46,7 @@ class MapMoment:
 
 
 @torch.no_grad()
-def taken(
+def take_map_moment(
     mapper: Mapper, sub_map: int, frame: WorldFrame, points: bool, pictures: bool
 ) -> MapMoment:
     """In the mapping thread: copies for ``points``, and ``pictures`` of the newest view; as long as
@@ -61,7 +61,7 @@ def taken(
             exposure = common_exposure([drawn_without_water(mapper.scene, view, seen.shown).image])
             restored = without_water(mapper, seen).picture_bytes(exposure)[..., :3]
     water = mapper.scene.water(view)
-    copy = copied(mapper) if points else None
+    copy = copy_map(mapper) if points else None
     return MapMoment(sub_map, copy, views, frame, view.frame_index, rendered, restored, water)
 
 
@@ -75,7 +75,7 @@ def cloud_of(moment: MapMoment, budget: int) -> npt.NDArray[np.void] | None:
         scales = np.exp(plain["log_scales"])
     splats = PlyGaussians(plain["means"], plain["quats"], scales, opacities, moment.copy.clear)
     where = placement(moment.frame)
-    upright = splats.transformed(moment.frame.T_nm).transformed(where.T_un)
+    upright = splats.transform(moment.frame.T_nm).transform(where.T_un)
     points = messages.packed_points(PointCloud(upright, moment.views, where))
     return points[:: -(-len(points) // budget)] if len(points) else points
 

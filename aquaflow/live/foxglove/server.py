@@ -24,7 +24,7 @@ from aquaflow.dive.ros.definitions import (
     MESSAGE_ENCODING,
     SCHEMA_ENCODING,
     definition,
-    encoded,
+    encode,
     require_rosbags,
 )
 from aquaflow.dive.ros.topics import OF_FINISHED_DIVES, TYPES
@@ -78,7 +78,7 @@ class FoxgloveServer:
         self._server = WebServer(config, self._access, _no_page, key, watcher=self._watch)
         self.port = self._server.port
 
-    def wanted(self, topic: str) -> bool:
+    def is_wanted(self, topic: str) -> bool:
         """True while a client has subscribed to it."""
         return bool(self._wanting(topic))
 
@@ -86,7 +86,7 @@ class FoxgloveServer:
         """Queue a message for every client that has subscribed."""
         wanting = self._wanting(topic)
         if wanting:
-            data = encoded(message)
+            data = encode(message)
             for client, subscription in wanting:
                 client.put(MESSAGE_HEADER.pack(MESSAGE_DATA, subscription, t_ns), data)
 
@@ -141,7 +141,7 @@ class FoxgloveServer:
         sending = asyncio.create_task(client.send_waiting())
         try:
             while (message := await receive())["type"] == "websocket.receive":
-                client.told(message.get("text") or "")
+                client.handle_text(message.get("text") or "")
         finally:
             with self._lock:
                 self._clients.discard(client)
@@ -189,7 +189,7 @@ class _Client:
         """Wait for nothing that it has not taken."""
         self._transport.abort()
 
-    def told(self, text: str) -> None:
+    def handle_text(self, text: str) -> None:
         """What is no request of the protocol is passed over."""
         try:
             said = json.loads(text)

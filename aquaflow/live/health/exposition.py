@@ -18,11 +18,11 @@ def head(name: str, kind: Kind, help_text: str) -> Iterator[str]:
 
 def sample(name: str, value: float, **labels: str) -> str:
     """One line: a value, and the labels that tell it from the others of its metric."""
-    told = ",".join(f'{key}="{_escaped(text)}"' for key, text in labels.items())
+    told = ",".join(f'{key}="{_escape(text)}"' for key, text in labels.items())
     return f"aquaflow_{name}{{{told}}} {value}" if told else f"aquaflow_{name} {value}"
 
 
-def labelled(
+def label(
     name: str, label: str, values: Mapping[str, float], help_text: str, kind: Kind = "counter"
 ) -> Iterator[str]:
     """A metric whose values are told apart by one label."""
@@ -31,5 +31,5 @@ def labelled(
         yield sample(name, value, **{label: text})
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")

@@ -41,7 +41,7 @@ class Heartbeats:
         now = self._now_s()
         return {stage: now - last for stage, last in dict(self._last_s).items()}
 
-    def hung(self, longer_than_s: float) -> str | None:
+    def find_hung_stage(self, longer_than_s: float) -> str | None:
         """The stage that was silent for longest, if longer than ``longer_than_s``."""
         ages = self.ages_s()
         stage = max(ages, key=lambda name: ages[name], default=None)
@@ -77,7 +77,7 @@ class Watchdog:
 
     def _run(self) -> None:
         while not self._closing.wait(self._look_s):
-            stage = self._heartbeats.hung(self._hang_s)
+            stage = self._heartbeats.find_hung_stage(self._hang_s)
             if stage is not None:
                 self._hung(stage, self._heartbeats.ages_s().get(stage, self._hang_s))
                 return

@@ -13,9 +13,9 @@ from urllib.parse import parse_qs
 from aquaflow import __version__
 from aquaflow.config.service import ListenConfig
 from aquaflow.live.control import ServiceControl
-from aquaflow.live.health.exposition import TYPE, head, labelled, sample
+from aquaflow.live.health.exposition import TYPE, head, label, sample
 from aquaflow.live.health.page import page_file
-from aquaflow.live.health.pilot_requests import MOST_BYTES, answered
+from aquaflow.live.health.pilot_requests import MOST_BYTES, answer
 from aquaflow.live.health.prometheus_devices import device_lines
 from aquaflow.live.health.state import ServiceState
 from aquaflow.web import HttpRequest, HttpResponse, WebServer
@@ -122,14 +122,14 @@ class _Answers:
     def __call__(self, request: HttpRequest) -> HttpResponse:
         """The answer with the headers that all have."""
         posted = request.method == "POST"
-        answer = self.posted(request) if posted else self.looked(request)
+        answer = self.answer_post(request) if posted else self.answer_get(request)
         headers = [*policies(request.headers.get("host", "")), *answer.headers]
         shown = request.target, request.headers, request.peer
         if answer.status != HTTPStatus.FORBIDDEN and self.access.by_query(*shown):
             headers.append(("Set-Cookie", self.access.cookie()))
         return replace(answer, headers=headers)
 
-    def looked(self, request: HttpRequest) -> HttpResponse:
+    def answer_get(self, request: HttpRequest) -> HttpResponse:
         """To a GET."""
         path = path_of(request.target)
         if path is None:
@@ -140,7 +140,7 @@ class _Answers:
             return _json(403, NOT_ALLOWED)
         return self.data(path)
 
-    def posted(self, request: HttpRequest) -> HttpResponse:
+    def answer_post(self, request: HttpRequest) -> HttpResponse:
         """To a POST."""
         if request.body is None:
             return _json(413, {"error": "a request holds a token at most"})
@@ -148,7 +148,7 @@ class _Answers:
             return self.log_in(request)
         dive = self.report().get("dive") or {}
         name, target, headers = dive.get("name"), request.target, request.headers
-        return _json(*answered(self.control, self.access, target, headers, name, request.peer))
+        return _json(*answer(self.control, self.access, target, headers, name, request.peer))
 
     def log_in(self, request: HttpRequest) -> HttpResponse:
         """The cookie for a form with the token; a minute without an answer after ten others."""
@@ -245,9 +245,7 @@ def exposition(report: Mapping[str, Any]) -> str:
 
 def _lines(report: Mapping[str, Any]) -> Iterator[str]:
     states = {state.value: int(report["state"] == state.value) for state in ServiceState}
-    yield from labelled(
-        "state", "state", states, "1 for the state that the service is in.", "gauge"
-    )
+    yield from label("state", "state", states, "1 for the state that the service is in.", "gauge")
     yield from head("ok", "gauge", "1 while nothing is to be done about it.")
     yield sample("ok", int(report["ok"]))
     for name, help_text in COUNTERS.items():
@@ -258,15 +256,15 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         yield sample(name, report[name])
     lags = {quantile: report["lag_ms"][key] for key, quantile in QUANTILES.items()}
     lags_s = {quantile: lag_ms / 1e3 for quantile, lag_ms in lags.items() if lag_ms is not None}
-    yield from labelled(
+    yield from label(
         "lag_seconds", "quantile", lags_s, "From a frame's arrival to its pose, last minute.",
         "gauge",
     )  # fmt: skip
-    yield from labelled("frames_by_class_total", "class", report["classes"], "Frames by result.")
-    yield from labelled(
+    yield from label("frames_by_class_total", "class", report["classes"], "Frames by result.")
+    yield from label(
         "left_out_total", "reason", report["left_out_of_the_map"], "Frames that the map never saw."
     )
-    yield from labelled("state_visits_total", "state", report["visits"], "Times in each state.")
+    yield from label("state_visits_total", "state", report["visits"], "Times in each state.")
     yield from head("stage_failures_total", "counter", "Failures of a stage, by exception.")
     for kind in report["stage_failures"]:
         labels = {key: kind[key] for key in ("stage", "error", "place")}
@@ -275,10 +273,10 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
     if poses is not None:
         yield from head("poses_sent_total", "counter", "Poses sent to the autopilot.")
         yield sample("poses_sent_total", poses["sent"])
-        yield from labelled(
+        yield from label(
             "poses_withheld_total", "reason", poses["withheld"], "Poses not sent to the autopilot."
         )
-    yield from labelled(
+    yield from label(
         "stage_share", "stage", report["stage_shares"], "Seconds per second in a stage.", "gauge"
     )
     yield from device_lines(report["devices"])

@@ -21,7 +21,7 @@ NOT_ALLOWED = {
 """Answer to who may not ask."""
 
 
-def answered(
+def answer(
     control: ServiceControl,
     access: Access,
     target: str,

@@ -17,6 +17,8 @@ MILLIDEGREES = 1000.0
 """In a degree: the unit of thermal zones in /sys."""
 HOTTEST_C = 150.0
 """Thermal zones that report more are not connected."""
+GPU_MEMORY_SHARE = 0.05
+"""Of the memory of the GPU that the map lives on, what must stay free."""
 
 
 class Shortage(Enum):
@@ -52,7 +54,7 @@ class Pressure:
             return Need(Shortage.MEMORY, f"{100 * memory:.0f} % of the memory is left")
         if heat is not None and heat > limits.temperature_c:
             return Need(Shortage.HEAT, f"the machine is {heat:.0f} degC hot")
-        if gpu is not None and gpu < limits.gpu_memory_share:
+        if gpu is not None and gpu < GPU_MEMORY_SHARE:
             return Need(Shortage.GPU_MEMORY, f"{100 * gpu:.0f} % of the GPU's memory is left")
         return None
 

@@ -120,7 +120,7 @@ class Facts:
     """Why the service works with less than everything."""
 
 
-def judged(facts: Facts) -> Judgement:
+def judge(facts: Facts) -> Judgement:
     """The state that follows from the facts, and its reason."""
     if facts.frame_age_s > facts.patience_s:
         said = f": {facts.camera.reason}" if facts.camera.reason else ""

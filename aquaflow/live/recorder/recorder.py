@@ -60,7 +60,7 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def mounted(self, camera: str, mounting: MountingConfig | None) -> None:
+    def record_mounting(self, camera: str, mounting: MountingConfig | None) -> None:
         """State how a camera sits in the vehicle, before its first picture; None: not known."""
         if mounting is not None:
             self._writer.mountings[camera] = mounting
@@ -82,7 +82,7 @@ class Recorder:
         self._closing.set()
         self._queue.wake()
         self._thread.join()
-        self.status.dropped = self._queue.dropped()
+        self.status.dropped = self._queue.drop()
         return self.status
 
     def _prepare_folder(self) -> None:
@@ -124,7 +124,7 @@ class Recorder:
             elif self._closing.is_set():
                 return
             if time.monotonic() >= due:
-                self.status.dropped = self._queue.dropped()
+                self.status.dropped = self._queue.drop()
                 self._writer.flush()
                 due = time.monotonic() + self._settings.flush_s
                 full = self._full()

@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.live.recorder.recorder import Recorder
-from aquaflow.recordings.playback import Event, Playback, arrival_of, arrived
+from aquaflow.recordings.playback import Event, Playback, arrival_of, delay_event
 from aquaflow.sources import CameraSource, RawTap, TelemetrySource
 from aquaflow.sources.wall_clock import WallClock
 from aquaflow.types import Dropped, Frame, TelemetrySample
@@ -78,10 +78,10 @@ class RecordingSession:
                     return
                 now_ns = time.monotonic_ns()
                 shift_ns = now_ns - arrival_of(event) if shift_ns is None else shift_ns
-                self._hand_over(name, arrived(event, shift_ns, now_ns))
+                self._hand_over(name, delay_event(event, shift_ns, now_ns))
 
         try:
-            self.recorder.mounted(name, playback.stated_mounting())
+            self.recorder.record_mounting(name, playback.stated_mounting())
         except AquaFlowError as error:
             self.notes.append(str(error))
         self._pumps.append((f"recording '{name}'", pump))
@@ -91,7 +91,7 @@ class RecordingSession:
         """Record; returns when all is on the disk. Why it ended early is in the status."""
         threads, endless = (
             [
-                threading.Thread(target=self._guarded, args=pump, name=pump[0], daemon=True)
+                threading.Thread(target=self._guard, args=pump, name=pump[0], daemon=True)
                 for pump in pumps
             ]
             for pumps in (self._pumps, self._endless)
@@ -132,7 +132,7 @@ class RecordingSession:
 
         return pump
 
-    def _guarded(self, name: str, pump: Pump) -> None:
+    def _guard(self, name: str, pump: Pump) -> None:
         """One source that fails costs its own data; the others go on."""
         try:
             pump()

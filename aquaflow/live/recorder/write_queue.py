@@ -111,7 +111,7 @@ class WriteQueue:
         with self._changed:
             self._dropped[topic] += 1
 
-    def dropped(self) -> dict[str, int]:
+    def drop(self) -> dict[str, int]:
         """Dropped items by topic."""
         with self._changed:
             return dict(self._dropped)

@@ -51,9 +51,9 @@ class Arming:
         self._disarmed_s: float | None = None
         """When it was disarmed, until it is armed again or its dive finished."""
         if config.commands:
-            pilot.obey(self.asked)
+            pilot.obey(self.obey)
 
-    def asked(self, request: PilotRequest) -> bool:
+    def obey(self, request: PilotRequest) -> bool:
         """Pass a command on; False where it makes no sense now. For any thread."""
         try:
             self._control.ask(ServiceRequest(request))

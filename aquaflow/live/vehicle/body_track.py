@@ -65,7 +65,7 @@ class BodyTrack:
     def add(self, sighting: Sighting, place: Place) -> bool:
         """Take the next pose; True if it jumped, or the place of the map did."""
         pose = place(sighting.T_mc)
-        jumped = self._jumped(sighting, pose, place)
+        jumped = self._has_jumped(sighting, pose, place)
         if jumped or not self._continues(sighting):
             self._sightings.clear()
         self._sightings.append(sighting)
@@ -110,7 +110,7 @@ class BodyTrack:
         since_s = 1e-9 * (sighting.t_ns - newest.t_ns)
         return newest.sub_map == sighting.sub_map and 0.0 < since_s <= LONGEST_GAP_S
 
-    def _jumped(self, sighting: Sighting, pose: BodyPoseInWorld, place: Place) -> bool:
+    def _has_jumped(self, sighting: Sighting, pose: BodyPoseInWorld, place: Place) -> bool:
         if not self._sightings:
             return False
         newest, before = self._sightings[-1], self.pose

@@ -17,6 +17,12 @@ from aquaflow.render.views import View
 
 LOG_GAIN = 3.0
 """A Laplacian-of-Gaussian response, L1 over RGB, of 1 / LOG_GAIN counts as certain structure."""
+COVERED_ALPHA = 0.6
+"""Alpha from which the map covers a pixel."""
+SCALE_OF_SPACING = 0.6
+"""Sigma of a new Gaussian over the expected spacing."""
+MAX_SPACING_WIDTHS = 0.1
+"""Largest expected spacing over image width."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +49,8 @@ class TrackedRange:
 
 def tracked_range(pointmap: Pointmap, known_sigma: float) -> TrackedRange:
     """Known where the relative standard deviation is below ``known_sigma``; on the host."""
-    camera, pointmap = pointmap.camera, pointmap.completed(known_sigma)
-    known = torch.from_numpy(pointmap.known(known_sigma))
+    camera, pointmap = pointmap.camera, pointmap.complete(known_sigma)
+    known = torch.from_numpy(pointmap.is_known(known_sigma))
     length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
     depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
     Q = torch.from_numpy(pointmap.Q)
@@ -105,7 +111,7 @@ def insertion_probability(
     Smooth sand has no Laplacian, but it needs a few large Gaussians all the same.
     """
     P = structure(restored, config.sigma_px) - structure(rendered, config.sigma_px)
-    bare = torch.where(alpha < config.covered_alpha, config.bare_probability, 0.0)
+    bare = torch.where(alpha < COVERED_ALPHA, config.bare_probability, 0.0)
     return torch.maximum(P.clamp_min(0.0), bare)
 
 
@@ -176,8 +182,8 @@ def new_gaussians(
     share = (probability[rows, columns] * config.density).clamp(1e-4, 1.0)
     if config.selection == "threshold":
         share = torch.ones_like(share)  # neighbours are a pixel apart
-    spacing = share.rsqrt().clamp(1.0, config.max_spacing_widths * view.camera.width)
-    scale = config.scale_of_spacing * spacing * z[rows, columns] / view.camera.fx
+    spacing = share.rsqrt().clamp(1.0, MAX_SPACING_WIDTHS * view.camera.width)
+    scale = SCALE_OF_SPACING * spacing * z[rows, columns] / view.camera.fx
     opacity = (config.opacity * confidence[rows, columns]).clamp(0.05, 0.95)
     quats = torch.zeros(len(rows), 4, device=rows.device)
     quats[:, 0] = 1.0

@@ -44,7 +44,7 @@ def in_picture(
     return front & (across < reach * half_width) & (down < reach * half_height)
 
 
-def decoded(
+def decode(
     decoder: Decoder,
     trunk: Trunk,
     parameters: Mapping[str, Tensor],  # of a GaussianMap
@@ -87,7 +87,7 @@ def decoded_torch(
     places: Tensor,  # [V] int64
     centre: Tensor,  # [3], or [V, 3]
 ) -> dict[str, Tensor]:
-    """Reference implementation of :func:`decoded` in torch."""
+    """Reference implementation of :func:`decode` in torch."""
     rows = trunk.tokens.rows[places]
     o = observation(parameters["means"].detach()[rows], centre)
     return apply_residuals(parameters, rows, decoder.residuals(trunk, places, o))

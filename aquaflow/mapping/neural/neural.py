@@ -30,6 +30,8 @@ OTHER_SIZE = 0.1
 """Relative change of a voxel's size in map units from which on the Gaussians are grouped anew;
 judgement: the unit in metres gets better all the time, and each time the features begin to fit
 other neighbours."""
+FEATURE_RATE = 4e-3
+"""Adam rate of the features of Gaussians and of groups (ARTDECO: 4e-3)."""
 
 
 class NeuralGaussians:
@@ -78,9 +80,9 @@ class NeuralGaussians:
         window = self._window
         if window is None or not window.has(view):
             self.settle()
-            window = self._window = DecodedWindow.opened(self.field, self._next_views(view))
+            window = self._window = DecodedWindow.decode_views(self.field, self._next_views(view))
         seen = window.go_on_to(view)
-        return self.field.decoded(window.trunk, seen, parameters, viewmat)
+        return self.field.decode(window.trunk, seen, parameters, viewmat)
 
     def settle(self) -> None:
         """End the window: one optimiser step of features and weights with its views' gradient."""
@@ -123,7 +125,7 @@ class NeuralGaussians:
             self.settle()
             self._looked = (view, centre, self.field.trunk(self.field.context([seen]), centre))
         assert self._looked is not None
-        return self.field.decoded(self._looked[2], seen, parameters, viewmat)
+        return self.field.decode(self._looked[2], seen, parameters, viewmat)
 
     def _looks_again(
         self,
@@ -136,13 +138,13 @@ class NeuralGaussians:
         return not self.decoder.observes_first or torch.equal(self._looked[1], centre)
 
     @torch.no_grad()
-    def baked(
+    def bake_parameters(
         self,
         centres: Tensor,  # [N, 3] of the camera that each Gaussian is seen from
     ) -> dict[str, Tensor]:
         """All parameters as plain Gaussians, each as its own camera sees it."""
         self.settle()
-        return self.field.baked(centres)
+        return self.field.bake_parameters(centres)
 
     # --- growing and following ----------------------------------------------------------------
 
@@ -217,7 +219,7 @@ class NeuralGaussians:
         if abs(size / self.groups.size - 1.0) <= OTHER_SIZE:
             return
         self.settle()
-        self.field.groups = resized(self.groups, self.gaussians.means, size)
+        self.field.groups = resize(self.groups, self.gaussians.means, size)
         self.optimisers.renew_shared()
         self.optimisers.bind()
 
@@ -240,7 +242,7 @@ class NeuralGaussians:
         optimisers.forget_gradients()
         whole = is_whole(self.groups, count)
         if not whole:
-            self.field.groups = regrouped(self.groups, self.gaussians.means)
+            self.field.groups = regroup(self.groups, self.gaussians.means)
         if not whole or len(optimisers.shared.steps) != len(self.groups):
             optimisers.renew_shared()
         if len(optimisers.local.steps) != count:
@@ -273,12 +275,12 @@ def is_whole(
     return listed and torch.equal(taken, groups.fill) and int(taken.sum()) == count
 
 
-def regrouped(
+def regroup(
     groups: VoxelGroups,
     means: Tensor,  # [N, 3] of all Gaussians
 ) -> VoxelGroups:
     """All Gaussians placed anew; a voxel's first group keeps the feature known of that voxel."""
-    new = _placed(groups, means, groups.size)
+    new = _place(groups, means, groups.size)
     known: dict[int, Tensor] = {}
     for voxel, feature in zip(groups_out(groups.voxel), groups.features, strict=False):
         known.setdefault(voxel, feature)
@@ -289,20 +291,20 @@ def regrouped(
     return new
 
 
-def resized(
+def resize(
     groups: VoxelGroups,
     means: Tensor,  # [N, 3] of all Gaussians
     size: float,
 ) -> VoxelGroups:
     """All Gaussians in voxels of ``size`` map units; a new group takes over the feature that its
     first Gaussian's had."""
-    new = _placed(groups, means, size)
+    new = _place(groups, means, size)
     if len(new):
         new.features.copy_(groups.features[groups.group[new.table[:, 0]]])
     return new
 
 
-def _placed(
+def _place(
     groups: VoxelGroups,
     means: Tensor,  # [N, 3]
     size: float,
@@ -334,7 +336,7 @@ class FeatureOptimisers:
         name: str,
         features: Tensor,  # [N, F]
     ) -> SelectiveAdam:
-        groups = {name: (features, self.field.config.feature_rate)}
+        groups = {name: (features, FEATURE_RATE)}
         return SelectiveAdam(groups, self._betas, threads=self.field.threads)
 
     def step(self, window: DecodedWindow) -> None:
@@ -363,8 +365,8 @@ class FeatureOptimisers:
     def slow_down(self, factor: float) -> None:
         """Set the learning rates to this share of the configured ones."""
         config = self.field.config
-        self.local.learning_rates["local"] = factor * config.feature_rate
-        self.shared.learning_rates["shared"] = factor * config.feature_rate
+        self.local.learning_rates["local"] = factor * FEATURE_RATE
+        self.shared.learning_rates["shared"] = factor * FEATURE_RATE
         self.weights.rates[0] = factor * config.rate
 
     def renew_shared(self) -> None:
@@ -404,7 +406,7 @@ class DecodedWindow:
     """Each with the Gaussians [N] bool that it shows."""
 
     @staticmethod
-    def opened(field: NeuralField, views: Sequence[View]) -> DecodedWindow:
+    def decode_views(field: NeuralField, views: Sequence[View]) -> DecodedWindow:
         """The window of ``views``; if the trunk takes an observation, it is the first one's."""
         means = field.gaussians.means
         seen = [in_picture(means, each, each.viewmat()) for each in views]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from aquaflow.config.mapping import DecoderConfig
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
-from aquaflow.mapping.neural.decode import decoded, decoded_torch
+from aquaflow.mapping.neural.decode import decode, decoded_torch
 from aquaflow.mapping.neural.decoder import Decoder, Trunk
 from aquaflow.mapping.neural.observation import observation
 from aquaflow.mapping.neural.tokens import Tokens, visible_tokens
@@ -69,7 +69,7 @@ class NeuralField:
         local, shared = features or (self.local, self.shared)
         return self.decoder.trunk(tokens, local, shared, self._observation(tokens, centres))
 
-    def decoded(
+    def decode(
         self,
         trunk: Trunk,
         seen: Tensor,  # [N] bool
@@ -78,10 +78,10 @@ class NeuralField:
     ) -> dict[str, Tensor]:
         """The parameters as the camera of ``viewmat`` sees them; differentiable."""
         centre, places = camera_centre(viewmat), trunk.tokens.places(seen)
-        return decoded(self.decoder, trunk, parameters, places, centre, self.threads)
+        return decode(self.decoder, trunk, parameters, places, centre, self.threads)
 
     @torch.no_grad()
-    def baked(
+    def bake_parameters(
         self,
         centres: Tensor,  # [N, 3] of the camera that each Gaussian is seen from
     ) -> dict[str, Tensor]:

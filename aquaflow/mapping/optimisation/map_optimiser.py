@@ -25,6 +25,11 @@ from aquaflow.render.views import View, refine_pose
 
 log = logging.getLogger(__name__)
 
+MAX_GRADIENT = 0.01
+"""Largest gradient norm of the medium that is kept (WaterSplatting clips at 0.001)."""
+PRUNE_RADIUS_WIDTHS = 0.5
+"""Radius over image width from which a Gaussian is pruned."""
+
 
 def is_number(
     value: Tensor,  # []
@@ -110,7 +115,7 @@ class MapOptimiser:
         medium = self.scene.medium
         if all(tensor.grad is None for tensor in self.medium_adam.tensors):
             return
-        norm = torch.nn.utils.clip_grad_norm_(medium.parameters(), self.config.medium.max_gradient)
+        norm = torch.nn.utils.clip_grad_norm_(medium.parameters(), MAX_GRADIENT)
         if not is_number(norm):
             self._undo("medium gradient", view)
             return
@@ -155,7 +160,7 @@ class MapOptimiser:
     def _prune(self, shown: RenderedMap, view: View) -> None:
         """Drop Gaussians that are almost transparent, or that fill the picture."""
         opaque = self.scene.gaussians.opacities > self.config.optimiser.prune_opacity
-        widest = self.config.optimiser.prune_radius_widths * view.camera.width
+        widest = PRUNE_RADIUS_WIDTHS * view.camera.width
         self.keep(opaque & (shown.radius_px < widest))
 
     def drop_unsound(self) -> None:

@@ -58,13 +58,13 @@ def register(
         view.light = light_at(view.frame_index, mapped)
     if config.heldout_steps == 0 or len(scene.gaussians) == 0:
         return
-    pose = _aligned(_Picture(view, scene), config.heldout_steps)
+    pose = _align(_Picture(view, scene), config.heldout_steps)
     R, t = pose[:3, :3], pose[:3, 3]
     # The identity puts a product of rotations back on the group.
     view.T_wc = (Sim3(R.T, -R.T @ t, view.T_wc.scale) @ Sim3.identity()).if_finite()
 
 
-def _aligned(picture: _Picture, most_steps: int) -> Array:
+def _align(picture: _Picture, most_steps: int) -> Array:
     """The view matrix [4, 4] at which the map fits best."""
     fit = picture.fit(picture.view.world_to_camera())
     trial = picture.trial()
@@ -73,7 +73,7 @@ def _aligned(picture: _Picture, most_steps: int) -> Array:
         if derivatives is None:
             derivatives = picture.derivatives(fit, trial)
         step = _gauss_newton_step(fit, derivatives)  # in units of ``trial``
-        moved = picture.fit(_moved(fit.viewmat, step * trial))
+        moved = picture.fit(_move(fit.viewmat, step * trial))
         if not moved.cost < fit.cost:
             break
         fit, moved_px = moved, TRIAL_PX * float(np.abs(step).max())
@@ -140,7 +140,7 @@ class _Picture:
     ) -> Tensor:
         """[6, P, 3] how each trial step of the tangent changes the drawing."""
         steps = np.diag(trial)
-        return torch.stack([self._draw(_moved(fit.viewmat, step)) - fit.image for step in steps])
+        return torch.stack([self._draw(_move(fit.viewmat, step)) - fit.image for step in steps])
 
     def _draw(
         self,
@@ -167,7 +167,7 @@ def _gauss_newton_step(
     return np.asarray(-np.linalg.solve(A, b))
 
 
-def _moved(
+def _move(
     viewmat: Array,  # [4, 4]
     tangent: Array,  # [6] translation, map units, then rotation, rad; in the camera's axes
 ) -> Array:

@@ -78,7 +78,7 @@ def export(
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()) and not (folder / CARD).is_file():
         raise InputError(f"{folder} is not empty; give a new folder")
-    frozen = folded(network)
+    frozen = fold(network)
     progress("export", 0, 3)
     _write_encoder(frozen, folder / ENCODER)
     progress("export", 1, 3)
@@ -144,7 +144,7 @@ def load_checkpoint(path: Path) -> CompactPrior:
     return network.eval()
 
 
-def folded(network: CompactPrior) -> CompactPrior:
+def fold(network: CompactPrior) -> CompactPrior:
     """A copy for inference, its normalisations folded into the convolutions before them."""
     network = copy.deepcopy(network).eval()
     network.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]

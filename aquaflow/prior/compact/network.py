@@ -1,7 +1,7 @@
 """The compact prior's network: a siamese encoder, and a head that compares two encodings.
 
 The encoder sees pictures whose local mean and contrast are made equal, and never where a pixel
-lies: descriptors that know their position learn nothing else (docs/measurements.md#compact-prior).
+lies: descriptors that know their position learn nothing else (notes/measurements.md#compact-prior).
 """
 
 from __future__ import annotations
@@ -92,10 +92,10 @@ class Encoder(nn.Module):
         super().__init__()
         a, b, c, d = size.levels
         e, f, g = size.merged
-        self.down_2 = nn.Sequential(convolved(3, a, 5, 2), Residual(a))
-        self.down_4 = nn.Sequential(convolved(a, b, 3, 2), Residual(b))
-        self.down_8 = nn.Sequential(convolved(b, c, 3, 2), Residual(c), Residual(c))
-        self.down_16 = nn.Sequential(convolved(c, d, 3, 2), Residual(d), Residual(d), Residual(d))
+        self.down_2 = nn.Sequential(convolve(3, a, 5, 2), Residual(a))
+        self.down_4 = nn.Sequential(convolve(a, b, 3, 2), Residual(b))
+        self.down_8 = nn.Sequential(convolve(b, c, 3, 2), Residual(c), Residual(c))
+        self.down_16 = nn.Sequential(convolve(c, d, 3, 2), Residual(d), Residual(d), Residual(d))
         self.up_8, self.up_4, self.up_2 = Up(d, c, e), Up(e, b, f), Up(f, a, g)
         self.coarse = nn.Conv2d(e, size.coarse, 1)
         self.fine = nn.Conv2d(g, size.fine, 1)
@@ -122,7 +122,7 @@ class CompactDecoder(nn.Module):
         super().__init__()
         self.sharpness = nn.Parameter(torch.tensor(2.6))
         self.range = nn.Sequential(
-            convolved(size.coarse + 5, size.head, 3, 1),
+            convolve(size.coarse + 5, size.head, 3, 1),
             Residual(size.head, dilation=2),
             Residual(size.head, dilation=4),
             nn.Conv2d(size.head, 2, 1),
@@ -239,7 +239,7 @@ def _smooth(
     )
 
 
-def convolved(channels: int, out: int, size: int, stride: int, dilation: int = 1) -> nn.Sequential:
+def convolve(channels: int, out: int, size: int, stride: int, dilation: int = 1) -> nn.Sequential:
     """Convolution, normalisation over the batch, ReLU."""
     padding = size // 2 * dilation
     return nn.Sequential(
@@ -254,8 +254,8 @@ class Residual(nn.Module):
 
     def __init__(self, channels: int, dilation: int = 1) -> None:
         super().__init__()
-        self.first = convolved(channels, channels, 3, 1, dilation)
-        self.second = convolved(channels, channels, 3, 1)[:2]
+        self.first = convolve(channels, channels, 3, 1, dilation)
+        self.second = convolve(channels, channels, 3, 1)[:2]
 
     def forward(
         self,

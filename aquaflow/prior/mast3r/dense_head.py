@@ -50,18 +50,18 @@ class FeatureFusion(nn.Module):
         """[B, C, 2h, 2w]"""
         if level is not None:
             x = x + self.resConfUnit1(level)
-        return self.out_conv(doubled(self.resConfUnit2(x)))  # type: ignore[no-any-return]
+        return self.out_conv(double(self.resConfUnit2(x)))  # type: ignore[no-any-return]
 
 
 class Doubled(nn.Module):
-    """``doubled`` as a layer of a sequence."""
+    """``double`` as a layer of a sequence."""
 
     def forward(
         self,
         x: Tensor,  # [B, C, h, w]
     ) -> Tensor:
         """[B, C, 2h, 2w]"""
-        return doubled(x)
+        return double(x)
 
 
 class Scratch(nn.Module):
@@ -128,7 +128,7 @@ class DenseHead(nn.Module):
         return self.head(self.scratch([stage(grid) for stage, grid in levels]))  # type: ignore[no-any-return]
 
 
-def doubled(
+def double(
     x: Tensor,  # [B, C, h, w]
 ) -> Tensor:
     """[B, C, 2h, 2w] bilinear, corner to corner."""

@@ -46,12 +46,12 @@ class Mast3rDescriber:
         self._encoder = NetworkSession(folder / ENCODER, settings)
         self._decoder = NetworkSession(folder / DECODER, settings)
 
-    def fitted(
+    def fit(
         self,
         image: Picture,  # [H, W, 3] RGB
     ) -> Picture:
         """[h, w, 3] of the size that was exported, with the picture in its middle."""
-        return self._framing(*image.shape[:2]).framed(image)
+        return self._framing(*image.shape[:2]).frame(image)
 
     def features(
         self,
@@ -60,7 +60,7 @@ class Mast3rDescriber:
         """[1, N, D] tokens."""
         return self._encoder({"image": as_input(picture)})["tokens"].astype(np.float16)
 
-    def compared(
+    def compare(
         self,
         a: Half,  # [1, N, D]
         b: Half,  # [1, N, D]
@@ -71,7 +71,7 @@ class Mast3rDescriber:
         framings = (self._framing(camera.height, camera.width) for camera in (camera_a, camera_b))
         return Mast3rPair(self, a, b, *framings)
 
-    def decoded(
+    def decode(
         self,
         a: Half,  # [1, N, D]
         b: Half,  # [1, N, D]
@@ -110,7 +110,7 @@ class Mast3rPair:
     @cached_property
     def range_b(self) -> LearnedRange:
         """From the pair the other way round: that has its points in b's own frame."""
-        return _range_of_points(self.describer.decoded(self.b, self.a), self.framing_b)
+        return _range_of_points(self.describer.decode(self.b, self.a), self.framing_b)
 
     @cached_property
     def confidence(self) -> Float:
@@ -125,7 +125,7 @@ class Mast3rPair:
 
     @cached_property
     def _decoded(self) -> Mapping[str, Float]:
-        return self.describer.decoded(self.a, self.b)
+        return self.describer.decode(self.a, self.b)
 
 
 def _at_cells(

@@ -57,7 +57,7 @@ class ColourChange:
     gains: tuple[float, float, float]
     """Of the second day's colours, that were taken off."""
 
-    def bleached(self) -> Array:
+    def bleach(self) -> Array:
         """[N] probability of a place as much lighter and less saturated where nothing changed."""
         up = norm.sf(self.lighter / self.sigma_lighter)
         down = norm.cdf(self.purer / self.sigma_purer)
@@ -104,8 +104,8 @@ def colour_change(first: PlaceColours, second: PlaceColours) -> ColourChange:
     purer = np.where(lit, _saturation(after) - _saturation(before), np.nan)
     stated = np.hypot(first.sigma, second.sigma)
     # Colours that are wrong alike on all channels leave the saturation as it is.
-    lighter, sigma_lighter = _centred(lighter, stated)
-    purer, sigma_purer = _centred(purer, stated * 0.5 * (_saturation(after) + _saturation(before)))
+    lighter, sigma_lighter = _centre(lighter, stated)
+    purer, sigma_purer = _centre(purer, stated * 0.5 * (_saturation(after) + _saturation(before)))
     red, green, blue = gains.tolist()
     return ColourChange(lighter, purer, sigma_lighter, sigma_purer, (red, green, blue))
 
@@ -117,7 +117,7 @@ def _saturation(
     return np.asarray(colours.std(axis=1) / colours.mean(axis=1))
 
 
-def _centred(
+def _centre(
     values: Array,  # [N]
     sigma: Array,  # [N]
 ) -> tuple[Array, Array]:

@@ -59,7 +59,7 @@ class SurfaceComparison:
         """[N] probability of a place as far from 0 as it is, of its colour or its distance, where
         nothing changed."""
         if kind == BLEACHED:
-            return self.colours.bleached()
+            return self.colours.bleach()
         return two_sided(self.distances.distance / self.distances.sigma, self.distances.freedom)
 
 
@@ -84,7 +84,7 @@ def compare(
         NORMAL_RESOLUTIONS * resolution, cylinder or CYLINDER_RESOLUTIONS * resolution,
         reach or REACH_RESOLUTIONS * resolution, resolution,
     )  # fmt: skip
-    places = thinned(first.points, resolution)
+    places = thin(first.points, resolution)
     normals = normals_at(places, first.points, first.normals, scales.normal)
     stated = m3c2(
         DayPoints(first.points, first.sigma, first.normals),
@@ -100,13 +100,13 @@ def compare(
         shown_at(second, there, COLOUR_RESOLUTIONS * resolution),
     )
     kinds = classes(distances, colours, false_discoveries)
-    kinds[hidden(first, second, places, there, kinds)] = NOT_SEEN
+    kinds[is_hidden(first, second, places, there, kinds)] = NOT_SEEN
     return SurfaceComparison(
         places, first.area / max(len(places), 1), distances, colours, kinds, (middle, wider), scales
     )
 
 
-def hidden(
+def is_hidden(
     first: Surface,
     second: Surface,
     places: Array,  # [N, 3]
@@ -126,7 +126,7 @@ def classes(distances: SurfaceDistances, colours: ColourChange, rate: float) -> 
     """[N] of each place; ``rate``: of false discoveries, of distances and of colours each."""
     kinds = np.full(len(distances.distance), NOT_SEEN, np.int8)
     kinds[distances.seen] = UNCHANGED
-    bleached = np.where(distances.seen, colours.bleached(), np.nan)
+    bleached = np.where(distances.seen, colours.bleach(), np.nan)
     kinds[discoveries(bleached, rate)] = BLEACHED
     # What stands there now is another surface, whatever its colour.
     chance = two_sided(distances.distance / distances.sigma, distances.freedom)
@@ -136,7 +136,7 @@ def classes(distances: SurfaceDistances, colours: ColourChange, rate: float) -> 
     return kinds
 
 
-def thinned(
+def thin(
     points: Array,  # [N, 3]
     side: float,
 ) -> Array:

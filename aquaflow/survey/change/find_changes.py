@@ -115,7 +115,7 @@ def find_changes(asked: ChangeSettings, work: Path, progress: Progress) -> Chang
     registration = register(
         first.points, first.normals, second.points, resolution, START_RESOLUTIONS * resolution
     )
-    second = second.moved(registration.T)
+    second = second.move(registration.T)
     compared = compare(
         first, second, registration, asked.false_discoveries, asked.cylinder, asked.reach, progress
     )

@@ -41,7 +41,7 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
             written to.
     """
     merged = merge_of(site)
-    chosen = merged.chosen(component, site)
+    chosen = merged.choose(component, site)
     days, placed = [], []
     left_out: dict[str, str] = {}
     for dive in read_site(site):
@@ -62,7 +62,7 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
         raise InputError(f"component {chosen} of {site} has nothing to make a map of: {reasons}")
     parts = combine(days)
     stated = [
-        _stated(part, main, merged.fingerprints[main.dive])
+        _site_map_part(part, main, merged.fingerprints[main.dive])
         for part, main in zip(parts, placed, strict=True)
     ]
     write_site_map(site, chosen, stated, [part.gaussians for part in parts])
@@ -75,10 +75,10 @@ def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> 
     views = surfaces_of_map(mapper, placed.T_sm, work, partial(progress, f"views of {placed.dive}"))
     ply = "map_clear.ply" if dive.has("map_clear.ply") else "map.ply"
     gaussians = read_ply(dive.file(ply))
-    return DayMap(placed.dive, gaussians.transformed(placed.T_sn), views)
+    return DayMap(placed.dive, gaussians.transform(placed.T_sn), views)
 
 
-def _stated(part: Part, placed: PlacedSubMap, fingerprint: str) -> SiteMapPart:
+def _site_map_part(part: Part, placed: PlacedSubMap, fingerprint: str) -> SiteMapPart:
     return SiteMapPart(
         part.name, fingerprint, placed.T_sn.matrix.tolist(), len(part.gaussians.means),
         part.gone, part.replaced, list(part.gains),

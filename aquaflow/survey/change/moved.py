@@ -58,7 +58,7 @@ def with_moves(
         for a, lost in enumerate(patches)
         for b, gained in enumerate(patches)
         if lost.kind == LOST and gained.kind == GAINED
-        for pair in [_matched(a, b, lost, gained, compared, first, second, registration)]
+        for pair in [_match_pixels(a, b, lost, gained, compared, first, second, registration)]
         if pair is not None
     ]
     found, kinds, taken = list(patches), compared.kinds.copy(), set[int]()
@@ -79,7 +79,7 @@ def with_moves(
     return found, replace(compared, kinds=kinds)
 
 
-def _matched(
+def _match_pixels(
     a: int,
     b: int,
     lost: Patch,

@@ -22,7 +22,7 @@ from aquaflow.survey.change.comparison import (
     SurfaceComparison,
 )
 from aquaflow.survey.change.neighbours import pairs_within
-from aquaflow.survey.change.relief import ReliefWindow, filled
+from aquaflow.survey.change.relief import ReliefWindow, fill
 from aquaflow.survey.change.surface import Surface
 
 Array = npt.NDArray[np.float64]
@@ -80,7 +80,7 @@ def find_patches(
         if kind == BLEACHED:
             radius = COLOUR_RESOLUTIONS * compared.scales.apart
         least = LEAST_CYLINDERS * np.pi * radius**2
-        for which in connected(compared.places, compared.kinds == kind, compared.scales.apart):
+        for which in connect(compared.places, compared.kinds == kind, compared.scales.apart):
             if len(which) * compared.area >= least:
                 found.append(_patch(kind, which, compared, first, second))
                 kinds[which] = kind
@@ -88,7 +88,7 @@ def find_patches(
     return found, replace(compared, kinds=kinds.astype(np.int8))
 
 
-def connected(
+def connect(
     places: Array,  # [N, 3]
     chosen: npt.NDArray[np.bool_],  # [N]
     spacing: float,
@@ -160,4 +160,4 @@ def heights_of(window: ReliefWindow, compared: SurfaceComparison, surface: Surfa
     """[h, w] upper side of a surface over a window, with holes interpolated."""
     level = float(((compared.places - window.origin) @ window.axes[:, 2]).mean())
     reach = 4.0 * compared.scales.reach
-    return filled(window.heights(surface.points, (level - reach, level + reach)))
+    return fill(window.heights(surface.points, (level - reach, level + reach)))

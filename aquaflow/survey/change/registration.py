@@ -99,7 +99,8 @@ def register(
         change = _solve(rows, -pair.residuals, weights)
         T = _about(middle, change) @ T
         done = (
-            reach <= NARROWEST * resolution and _moved(change, points - middle) < STILL * resolution
+            reach <= NARROWEST * resolution
+            and _largest_move(change, points - middle) < STILL * resolution
         )
         reach = max(NARROWEST * resolution, NARROWING * reach)
         if done:
@@ -160,7 +161,7 @@ def _about(
     return Sim3(R, middle + change[:3] - scale * (R @ middle), scale)
 
 
-def _moved(
+def _largest_move(
     change: Array,  # [7]
     offsets: Array,  # [N, 3]
 ) -> float:

@@ -88,7 +88,7 @@ class ReliefWindow:
         return np.where(np.isfinite(found), found, np.nan)
 
 
-def filled(
+def fill(
     heights: Array,  # [h, w] NaN: unknown
 ) -> Array:
     """[h, w] with what is unknown between known cells interpolated, beyond them as the nearest."""

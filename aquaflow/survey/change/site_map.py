@@ -77,7 +77,7 @@ def combine(days: Sequence[DayMap]) -> list[Part]:
     """The parts of the one map, in the order of ``days``: the earliest first."""
     parts: list[Part] = []
     for number in reversed(range(len(days))):
-        gone, replaced = _overruled(days, number)
+        gone, replaced = _overrule(days, number)
         gains = _gains(days[number], replaced, parts)
         finite = np.isfinite(days[number].gaussians.means).all(axis=1)
         kept = days[number].gaussians.rows(finite & ~gone & ~replaced)
@@ -88,7 +88,7 @@ def combine(days: Sequence[DayMap]) -> list[Part]:
     return parts[::-1]
 
 
-def _overruled(days: Sequence[DayMap], number: int) -> tuple[Mask, Mask]:
+def _overrule(days: Sequence[DayMap], number: int) -> tuple[Mask, Mask]:
     """[N], [N] the Gaussians of a day that are gone, and those that another day shows."""
     day = days[number]
     places = np.asarray(day.gaussians.means, np.float64)

@@ -55,7 +55,7 @@ class Surface:
     T_views: Sim3
     """From the surface's axes to those of ``views``."""
 
-    def moved(self, T: Sim3) -> Surface:
+    def move(self, T: Sim3) -> Surface:
         """The same elsewhere."""
         return replace(
             self, points=T.apply(self.points), normals=self.normals @ T.R.T,

@@ -51,7 +51,7 @@ def near_bins(frame: GridFrame, limit: float | None) -> int:
     return int(np.searchsorted(middles, limit, side="right"))
 
 
-def classified(
+def classify(
     by_range: Counts,  # [..., 12] as in a tile
     by_direction: Sides,  # [..., 17] likewise
     near: int,

@@ -55,8 +55,8 @@ def write_coverage_file(path: Path, views: Mapping[int, PageView]) -> None:
             "scale": view.scale, "unit": view.unit,
             "seen": view.seen, "right": view.right, "up": view.up,
             "swath": state.swath, "overlap": state.overlap,
-            "lines": [_listed(asdict(line)) for line in state.lines],
-            "next_line": None if state.suggestion is None else _listed(asdict(state.suggestion)),
+            "lines": [_as_json(asdict(line)) for line in state.lines],
+            "next_line": None if state.suggestion is None else _as_json(asdict(state.suggestion)),
         }  # fmt: skip
     arrays[VALUES] = np.frombuffer(json.dumps(values).encode(), np.uint8)
     with atomic_write(path) as stream:
@@ -112,7 +112,7 @@ def _view(
     )  # fmt: skip
 
 
-def _listed(values: dict[str, Any]) -> dict[str, Any]:
+def _as_json(values: dict[str, Any]) -> dict[str, Any]:
     """For JSON."""
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value

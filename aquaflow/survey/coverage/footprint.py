@@ -37,8 +37,8 @@ class Footprint:
     @staticmethod
     def of(pointmap: Pointmap) -> Footprint:
         """The footprint of a pointmap, with what a prior knows where nothing was triangulated."""
-        whole = pointmap.completed(LARGEST_SIGMA)
-        known = whole.known(LARGEST_SIGMA)
+        whole = pointmap.complete(LARGEST_SIGMA)
+        known = whole.is_known(LARGEST_SIGMA)
         return Footprint(whole.camera, _depths(np.where(known, whole.rho, 0.0)))
 
     @property

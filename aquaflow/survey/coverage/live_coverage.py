@@ -111,7 +111,7 @@ class LiveCoverage(CoverageView):
 
     def to_json(self) -> dict[int, dict[str, Any]]:
         """By sub-map: the picture of the cells and how it lies on the page, lines and areas."""
-        return {number: described(view) for number, view in self._views.items()}
+        return {number: describe(view) for number, view in self._views.items()}
 
     def in_words(self) -> list[str]:
         """The hints that hold, with their values."""
@@ -167,13 +167,13 @@ class LiveCoverage(CoverageView):
         coverage.look(slam.keyframes, slam.metric_frame)
         coverage.update()
         views = coverage.views(slam.keyframes, slam.metric_frame, self._limits)
-        measured = self._judged(coverage, views)
+        measured = self._judge(coverage, views)
         if self._dive is dive:  # else the dive ended meanwhile
             self.turns += 1
             self._views, self._measured = views, measured
             self.hints = hints.judge(measured)
 
-    def _judged(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> CoverageFigures:
+    def _judge(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> CoverageFigures:
         """The newest values of what hints are about."""
         if not self._places:
             return CoverageFigures()
@@ -216,7 +216,7 @@ def coverage_of(dive: RunningDive) -> DiveCoverage | None:
     return made.coverage if isinstance(made, CoverageFiles) else None
 
 
-def described(view: PageView) -> dict[str, Any]:
+def describe(view: PageView) -> dict[str, Any]:
     """For the page: lengths in the view's unit, places right and up."""
     state, plan = view.state, view.plan
     suggestion = state.suggestion

@@ -64,7 +64,7 @@ def line_state(
     before = _neighbour(newest, lines[:-1], swath)
     aside = None if before is None else newest.aside(0.5 * (before.start + before.end))
     found = None if aside is None else 1.0 - abs(aside) / swath
-    suggestion = _suggested(newest, before, aside, swath, overlap, covered)
+    suggestion = _suggest(newest, before, aside, swath, overlap, covered)
     return LineState(lines, swath, found, suggestion)
 
 
@@ -77,7 +77,7 @@ def _neighbour(line: SurveyLine, earlier: list[SurveyLine], swath: float) -> Sur
     return None
 
 
-def _suggested(
+def _suggest(
     newest: SurveyLine, before: SurveyLine | None, aside: float | None, swath: float,
     overlap: float,
     covered: Covered,

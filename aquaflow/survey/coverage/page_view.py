@@ -43,7 +43,7 @@ class PageView:
         """Of a class, in the square of ``unit``."""
         return self.plan.area(seen) * self.scale**2
 
-    def rescaled(self, times: float, unit: str) -> PageView:
+    def rescale(self, times: float, unit: str) -> PageView:
         """The same in another unit, of which one of before is ``times``."""
         state = self.state
         lines = [

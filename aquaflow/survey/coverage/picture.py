@@ -54,7 +54,7 @@ def coverage_png(view: PageView, hints: str = "") -> bytes:
     """A PNG file of ``view``, WIDTH x HEIGHT, with a line of ``hints`` on top."""
     from PIL import Image, ImageDraw
 
-    fit = _fitted(view)
+    fit = _fit(view)
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
     cells = view.classes_at(fit.page(np.dstack([columns, rows]) + 0.5))
     pixels = _palette()[cells]
@@ -94,7 +94,7 @@ def _palette() -> Rgb:
     return np.array([COLOURS.get(seen, PAPER) for seen in CoverageClass], np.uint8)
 
 
-def _fitted(view: PageView) -> _PageTransform:
+def _fit(view: PageView) -> _PageTransform:
     rows, columns = view.plan.classes.shape
     corners = np.array([[0, 0, 1], [columns, 0, 1], [0, rows, 1], [columns, rows, 1]])
     places = [corners @ cells_affine(view).T, view.path]

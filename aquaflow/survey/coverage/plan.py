@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.coverage.classes import Classes, CoverageClass, classified, near_bins
+from aquaflow.survey.coverage.classes import Classes, CoverageClass, classify, near_bins
 from aquaflow.survey.coverage.layer import CoverageLayer
 from aquaflow.survey.coverage.raster import GridFrame
 from aquaflow.survey.coverage.tiles import TILE
@@ -108,7 +108,7 @@ def plan_of(
         chosen = [tiles[int(x), int(y)] for x, y in some]
         by_range = np.stack([tile.by_range for tile in chosen])
         by_direction = np.stack([tile.by_direction for tile in chosen])
-        whole = classified(by_range, by_direction, near, config)
+        whole = classify(by_range, by_direction, near, config)
         counts += np.bincount(whole.ravel(), minlength=len(CoverageClass))
         by_range = by_range[:, ::step, ::step]
         count = by_range.sum(axis=3, dtype=np.uint16)

@@ -113,7 +113,7 @@ class SubMapCoverage:
         drawn = [n for n in numbers if layer is not None and n in layer.drawn]
         if layer is None or not drawn:
             return
-        for number, cells in zip(drawn, self._moved(layer, drawn), strict=True):
+        for number, cells in zip(drawn, self._moved_cells(layer, drawn), strict=True):
             if cells <= UNMOVED:
                 self._slightly.add(number)
             elif self._changed.get(number) != np.inf:
@@ -187,18 +187,18 @@ class SubMapCoverage:
             self._shown, self._next = layer, None
         return missing
 
-    def _moved(self, layer: CoverageLayer, numbers: list[int]) -> Array:
+    def _moved_cells(self, layer: CoverageLayer, numbers: list[int]) -> Array:
         """[K] cells by which the view of each has moved since it was drawn: the most of a point on
         the camera's axis and of two beside it."""
         now = Sim3Batch.of([self._seen[n][1] for n in numbers])
         then = Sim3Batch.of([layer.drawn[n][1] for n in numbers])
         depths = np.array([self._seen[n][0].depth for n in numbers])
         probes = depths[:, None, None] * PROBES
-        shift = _applied(now, probes) - _applied(then, probes)
+        shift = _apply(now, probes) - _apply(then, probes)
         return np.asarray(np.linalg.norm(shift, axis=2).max(axis=1) / layer.frame.cell)
 
 
-def _applied(
+def _apply(
     poses: Sim3Batch,
     points: Array,  # [K, 3, 3] three of each
 ) -> Array:

@@ -79,7 +79,7 @@ def survey_lines(
     A path without any turn is no way between two lines: it is one from the length ``alone`` on, if
     that is given. Of eight stills of an AUV, whole lines are 1.2 to 1.5 swaths long.
     """
-    kept = _thinned(path, SPACING * swath)
+    kept = _thin(path, SPACING * swath)
     if len(kept) < 2:
         return []
     points = path[kept]
@@ -88,13 +88,13 @@ def survey_lines(
     if alone is not None and len(corners) == 2:
         least = min(least, alone)
     for first, last in pairwise(corners):
-        start, end = _fitted(points[first : last + 1])
+        start, end = _fit(points[first : last + 1])
         if float(np.linalg.norm(end - start)) >= least:
             lines.append(SurveyLine(start, end, int(kept[first]), int(kept[last])))
     return lines
 
 
-def _thinned(
+def _thin(
     path: Array,  # [N, 2]
     spacing: float,
 ) -> npt.NDArray[np.intp]:
@@ -135,7 +135,7 @@ def _corners(
     return sorted(corners)
 
 
-def _fitted(
+def _fit(
     points: Array,  # [N, 2]
 ) -> tuple[Array, Array]:
     """The ends of the straight line of least squares through points, seen from the outer two."""

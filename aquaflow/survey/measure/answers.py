@@ -14,7 +14,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.measure.asked import Asked, GeodeticPoint, located
+from aquaflow.survey.measure.asked import Asked, GeodeticPoint, locate
 from aquaflow.survey.measure.drawn_heights import Progress, draw_heights
 from aquaflow.survey.measure.height_field import HeightField
 from aquaflow.survey.measure.points import MeasuredPoints
@@ -107,7 +107,7 @@ def answer(
         ground = ground_of(frame, mapper.views)
         drawn = draw_heights(mapper, ground, work, cell, progress)
     reach = drawn.reach if drawn is not None else _reach(mapper, frame)
-    points = located(asked, mapper, frame, dive, drawn, ground, reach)
+    points = locate(asked, mapper, frame, dive, drawn, ground, reach)
     scale = scale_of(frame)
     if chosen == "line" or drawn is None or ground is None:
         return PointMeasurements("line", points.places, {"length": path_length(points, scale)})

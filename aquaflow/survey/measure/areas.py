@@ -32,7 +32,7 @@ class Areas:
 def areas(field: HeightField, ratio: Quantity | None, scale: Scale) -> Areas:
     """``ratio``: surface over plan, as :func:`aquaflow.survey.measure.roughness.surface_ratio`
     has it; None where it is unknown."""
-    surveyed = _surveyed(field, scale)
+    surveyed = _survey_area(field, scale)
     seen = field.held.plain >= LEAST_VIEWS
     count = max(1, int(seen.sum()))
     mapped = float((field.mapped & seen).sum()) / count
@@ -53,7 +53,7 @@ def _all(field: HeightField) -> tuple[Counts, ...]:
     return held.plain, held.narrow, held.wide, held.raised
 
 
-def _surveyed(field: HeightField, scale: Scale) -> Quantity:
+def _survey_area(field: HeightField, scale: Scale) -> Quantity:
     size = float((field.held.plain >= LEAST_VIEWS).sum()) * field.cell**2
     sigma = float(np.hypot(_edge_sigma(field), 2.0 * scale.sigma * size))
     return Quantity.normal(size, sigma, scale.square_unit)

@@ -86,7 +86,7 @@ def parse_point(text: str) -> Asked:
     )
 
 
-def located(
+def locate(
     asked: list[Asked],
     mapper: Mapper,
     frame: WorldFrame,
@@ -104,14 +104,14 @@ def located(
     Raises:
         InputError: a point is outside of its picture, of the map, or of the ground.
     """
-    picked = [_located(each, mapper, frame, dive, field, ground) for each in asked]
+    picked = [_locate(each, mapper, frame, dive, field, ground) for each in asked]
     return MeasuredPoints(
         np.array([each.place for each in picked]), np.array([each.own for each in picked]),
         np.array([each.shared for each in picked]), reach,
     )  # fmt: skip
 
 
-def _located(
+def _locate(
     asked: Asked,
     mapper: Mapper,
     frame: WorldFrame,

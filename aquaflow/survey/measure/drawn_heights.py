@@ -30,7 +30,7 @@ MATCH_PX = 4.0
 flow (OpenCV's DIS: 8 x 8), from which depths are triangulated."""
 CELL_RESOLUTIONS = 3.0
 """Least side of a cell that is found, in resolutions of the map. On the synthetic reef of
-docs/measurements.md#reef-numbers rugosity is 4 % low at 3.3 of them and 7 % at 1.6."""
+notes/measurements.md#reef-numbers rugosity is 4 % low at 3.3 of them and 7 % at 1.6."""
 STEPS = (1.0, 2.0, 5.0)
 """Sides of cells that are found, times powers of ten: dives of one kind get the same."""
 BIN_FOOTPRINTS = 16.0
@@ -68,13 +68,15 @@ def draw_heights(
     low, high = ranges.low - 0.5 * reach, ranges.high + 0.5 * reach
     side = _cell(cell, resolution, *(high - low))
     grid = Grid.around(low, high, side, np.zeros(2))
-    height, blurred = _drawn(splats, grid, ranges.footprint, resolution, progress)
-    sigma, views = _over(grid, height, partial(_seen, ranges))
+    height, blurred = _draw(splats, grid, ranges.footprint, resolution, progress)
+    sigma, views = _over(grid, height, partial(_see, ranges))
     height[views < LEAST_VIEWS] = np.nan
     if not np.isfinite(height).any():
         raise InputError("no two views of the dive see the same ground; map a denser survey")
     blurred[np.isnan(height)] = np.nan
-    return HeightField(grid, height, blurred, sigma, _held(ranges, grid, height), resolution, reach)
+    return HeightField(
+        grid, height, blurred, sigma, _held_heights(ranges, grid, height), resolution, reach
+    )
 
 
 def _cell(asked: float | None, resolution: float, width: float, height: float) -> float:
@@ -111,7 +113,7 @@ def _spacing(
     return float(side * np.sqrt(len(bins) / max(1, int(inside.sum()))))
 
 
-def _drawn(
+def _draw(
     splats: GroundSplats, grid: Grid, footprint: float, resolution: float, progress: Progress | None
 ) -> tuple[Array, Array]:
     """[h, w] heights and blurred heights; NaN where the map does not cover half a cell."""
@@ -173,7 +175,7 @@ def _over(
     return values, counts
 
 
-def _seen(
+def _see(
     ranges: ViewRanges,
     points: Array,  # [M, 3] on the ground
 ) -> tuple[Array, Counts]:
@@ -181,7 +183,7 @@ def _seen(
     return seen.sigma, seen.count
 
 
-def _held(
+def _held_heights(
     ranges: ViewRanges,
     grid: Grid,
     height: Array,  # [h, w]

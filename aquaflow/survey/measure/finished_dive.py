@@ -39,7 +39,7 @@ def numbers_of_dive(
     dive.require(MEDIUM)
 
     def draw() -> tuple[HeightField, Ground]:
-        return _drawn(dive, mapper, work, cell, progress)
+        return _draw(dive, mapper, work, cell, progress)
 
     return reef_numbers(draw, _places(dive), _water(dive), scale_of(dive.frame))
 
@@ -59,12 +59,12 @@ def numbers_at_the_end(dive: Dive, until: Deadline) -> ReefNumbers:
         mapper = dive.maps.get(dive.main)
         if mapper is None or not mapper.views or len(mapper.gaussians) == 0:
             raise InputError("the map is empty; map a recording that shows more")
-        return _drawn(dive, mapper, dive.path, None, in_time)
+        return _draw(dive, mapper, dive.path, None, in_time)
 
     return reef_numbers(draw, _places(dive), _water(dive), scale_of(dive.frame))
 
 
-def _drawn(
+def _draw(
     dive: Dive, mapper: Mapper, work: Path, cell: float | None, progress: Progress | None
 ) -> tuple[HeightField, Ground]:
     from aquaflow.survey.measure.drawn_heights import draw_heights  # loads torch

@@ -133,14 +133,14 @@ def without(notes: Sequence[Note], keys: Sequence[str]) -> list[Note]:
     return [note for note in notes if note.key not in keys]
 
 
-def listed(notes: Sequence[Note]) -> list[str]:
+def list_notes(notes: Sequence[Note]) -> list[str]:
     """A line for each: its key, what it marks, and its text."""
     width = max((len(note.key) for note in notes), default=0)
     words = {"Point": "point", "LineString": "line", "Polygon": "area"}
     return [f"{note.key:<{width}}  {words[note.shape]:<5}  {note.text}" for note in notes]
 
 
-def scaled(
+def scale_notes(
     notes: Sequence[Note],
     times: float,
 ) -> list[Note]:

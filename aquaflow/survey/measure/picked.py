@@ -62,7 +62,7 @@ class PickedPoint:
     """[3, 3] covariance."""
 
 
-def seen(
+def measure_pixels(
     mapper: Mapper,
     view: View,
     pixels: Array,  # [N, 2] px of the mapped picture
@@ -132,9 +132,11 @@ def of_pixel(
         InputError: it is outside of the picture, or the map shows nothing there.
     """
     refuse_outside(view, pixel[None])
-    [point] = seen(mapper, view, pixel[None])
+    [point] = measure_pixels(mapper, view, pixel[None])
     click = CLICK_SIGMA_PX / view.camera.fx * point.range
-    return _picked(frame, point.place, point.ray, click, point.around, RANGE_SIGMA * point.range)
+    return _picked_point(
+        frame, point.place, point.ray, click, point.around, RANGE_SIGMA * point.range
+    )
 
 
 def of_map(
@@ -162,10 +164,10 @@ def of_map(
     offset = inside - centres[np.argmin(np.linalg.norm(centres - inside, axis=1))]
     distance = max(float(np.linalg.norm(offset)), size)
     ray = offset / distance
-    return _picked(frame, inside, ray, size, size, RANGE_SIGMA * distance)
+    return _picked_point(frame, inside, ray, size, size, RANGE_SIGMA * distance)
 
 
-def _picked(
+def _picked_point(
     frame: WorldFrame,
     place: Array,  # [3] in the sub-map's world
     ray: Array,  # [3] unit, in the same

@@ -33,7 +33,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.coverage.coverage_files import write_coverage
-from aquaflow.survey.measure.notes import read_notes, scaled, write_notes
+from aquaflow.survey.measure.notes import read_notes, scale_notes, write_notes
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import LARGEST_SCALE_SIGMA, SourceReport, WorldFrame
@@ -81,13 +81,13 @@ def rescale(dive: Dive, sub_map: int, lengths: Sequence[KnownLength], scale: Len
     texts, notes = {}, []
     if sub_map == main:
         dive.require(METRICS)
-        notes = scaled(read_notes(folder, before), times)
+        notes = scale_notes(read_notes(folder, before), times)
         texts[METRICS] = dive.metrics | frame_numbers(frames[main])
         if dive.medium_facts:
             texts[MEDIUM] = _medium(deepcopy(dive.medium_facts), frames[main], times)
     with rescaling(folder):
         for path, each in splats.items():
-            write_ply(path, _scaled(each, times))
+            write_ply(path, _scale(each, times))
         table = _rows(rows, sub_map, frames[sub_map], times)
         write_trajectory_csv(folder / trajectory_csv.NAME, table)
         write_tum(
@@ -101,7 +101,7 @@ def rescale(dive: Dive, sub_map: int, lengths: Sequence[KnownLength], scale: Len
             if notes:
                 write_notes(folder, notes, frames[main])
         if sub_map in seen:
-            seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
+            seen[sub_map] = seen[sub_map].rescale(times, frames[sub_map].unit)
             write_coverage(folder, seen, main)
         write_metric_file(folder, frames, main)
 
@@ -125,8 +125,8 @@ def _metric(frame: WorldFrame, lengths: Sequence[KnownLength], scale: LengthScal
     )
 
 
-def _scaled(splats: PlyGaussians, times: float) -> PlyGaussians:
-    return splats.transformed(Sim3(np.eye(3), np.zeros(3), times))
+def _scale(splats: PlyGaussians, times: float) -> PlyGaussians:
+    return splats.transform(Sim3(np.eye(3), np.zeros(3), times))
 
 
 def _rows(rows: Sequence[PoseRow], sub_map: int, frame: WorldFrame, times: float) -> list[PoseRow]:

@@ -22,8 +22,8 @@ Array = npt.NDArray[np.float64]
 
 MATCH_SIGMA = 0.25
 """What neighbouring cells err apart, over the sigma of rays known to 1 pixel: matches of two
-pictures err by 0.12 to 0.25 px (docs/measurements.md#backward); poses and camera, which make up the
-rest of a pixel, move whole pictures."""
+pictures err by 0.12 to 0.25 px (notes/measurements.md#backward); poses and camera, which make up
+the rest of a pixel, move whole pictures."""
 LEAST_CELLS = 30
 """With slopes, for statistics of them; judgement."""
 RELIEF_PERCENT = (2.0, 98.0)
@@ -53,7 +53,7 @@ def surface_ratio(field: HeightField) -> Quantity:
         each = [s * (2.0 + g2) / (1.0 + g2) ** 1.5 for g2 in squares]
         return float(np.nanmean(np.mean(each, axis=0)))
 
-    return _corrected(field, mean, bias)
+    return _correct(field, mean, bias)
 
 
 def chain_ratio(field: HeightField) -> Quantity:
@@ -83,7 +83,7 @@ def chain_ratio(field: HeightField) -> Quantity:
         each = [(noise / (1.0 + p**2) ** 1.5).ravel() for noise, p in links]
         return float(np.nanmean(np.concatenate(each)))
 
-    return _corrected(field, mean, bias)
+    return _correct(field, mean, bias)
 
 
 def slope(field: HeightField, percent: float, tilt_sigma_rad: float) -> Quantity:
@@ -136,7 +136,7 @@ def relief(field: HeightField, tilt_sigma_rad: float, scale_sigma: float, unit: 
     return _between(plain + lost, half, half, unit, 0.0)
 
 
-def _corrected(
+def _correct(
     field: HeightField, of: Callable[[Array], float], noise: Callable[[], float]
 ) -> Quantity:
     """A ratio of the heights, less what noise adds, with what the resolution took."""

@@ -17,8 +17,8 @@ from aquaflow.render.views import View
 from aquaflow.survey.measure.picked import (
     CLICK_SIGMA_PX,
     RANGE_SIGMA,
+    measure_pixels,
     refuse_outside,
-    seen,
     view_of_frame,
 )
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
@@ -44,14 +44,14 @@ def between_pixels(
         InputError: the dive has no map, did not map the frame, or the map is not there.
         ConfigError: the dive's settings cannot be read.
     """
-    mapper, view, sub_map = _mapped(dive, frame)
+    mapper, view, sub_map = _find_mapped_view(dive, frame)
     points = np.array([start, end], np.float64)
     refuse_outside(view, points)
     if np.linalg.norm(points[1] - points[0]) < LEAST_LENGTH_PX:
         raise InputError(
             f"the two points are less than {LEAST_LENGTH_PX:.0f} pixels apart; mark a longer length"
         )
-    a, b = seen(mapper, view, points)
+    a, b = measure_pixels(mapper, view, points)
     length = float(np.linalg.norm(b.place - a.place))
     along = (b.place - a.place) / length
     click = CLICK_SIGMA_PX / view.camera.fx * float(np.hypot(a.range, b.range))
@@ -84,7 +84,7 @@ def between_points(
     return KnownLength(-1, source, length, POINT_SIGMA * length, length_m, sigma_m, sub_map)
 
 
-def _mapped(dive: Dive, frame: int) -> tuple[Mapper, View, int]:
+def _find_mapped_view(dive: Dive, frame: int) -> tuple[Mapper, View, int]:
     """The map that has a view of the frame, the view, and the sub-map's number."""
     sub_maps = _sub_maps(dive)
     if frame not in sub_maps:

@@ -49,7 +49,7 @@ def path_length(points: MeasuredPoints, scale: Scale) -> Quantity:
     for k, (step, length) in enumerate(zip(steps, lengths, strict=True)):
         of_step = C[k, :, k] + C[k + 1, :, k + 1] - C[k, :, k + 1] - C[k + 1, :, k]
         directions[k] = step / length if length > 0.0 else np.linalg.eigh(of_step)[1][:, -1]
-        bias += _lengthened(float(length), of_step, directions[k])
+        bias += _lengthen(float(length), of_step, directions[k])
     J = np.zeros((count, 3))
     J[:-1] -= directions
     J[1:] += directions
@@ -73,7 +73,7 @@ def area(points: MeasuredPoints, scale: Scale) -> Quantity:
     up = normal / size if size > 0.0 else np.linalg.eigh(C_area)[1][:, -1]
     _refuse_crossing(points.places, up)
     J = 0.5 * np.cross(_chords(points.places), up)
-    return _with_scale(size, J, points, _lengthened(size, C_area, up), scale, 2)
+    return _with_scale(size, J, points, _lengthen(size, C_area, up), scale, 2)
 
 
 def plan_area(
@@ -108,7 +108,7 @@ def _with_scale(
     return Quantity.normal(value, float(np.sqrt(max(variance, 0.0))), unit)
 
 
-def _lengthened(
+def _lengthen(
     length: float,
     covariance: Array,  # [3, 3]
     direction: Array,  # [3] unit

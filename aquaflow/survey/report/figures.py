@@ -53,16 +53,16 @@ CURVE_SAMPLES = 128
 def path_svg(path: PathPlot) -> str:
     """The path seen from two sides: from above and from the side where gravity is known, else along
     the direction of least motion and across it."""
-    figure = drawn(9.0, 3.6, level_axes if path.up else path_axes, path)
+    figure = draw(9.0, 3.6, level_axes if path.up else path_axes, path)
     return svg_of(figure, "path")
 
 
 def medium_svg(medium: MediumCurves) -> str:
     """Transmission and backscatter over range."""
-    return svg_of(drawn(9.0, 3.1, medium_axes, medium), "medium")
+    return svg_of(draw(9.0, 3.1, medium_axes, medium), "medium")
 
 
-def drawn(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
+def draw(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
     """A figure in the report's style, into which ``draw`` has drawn ``data``."""
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -77,7 +77,7 @@ def _survey(pages: Pages, data: ReportData) -> None:
         pages.table(survey_sections.coverage_rows(view))
     if data.overview is not None:
         pages.heading("The map from above, without water", OVERVIEW_IN)
-        pages.picture(_decoded(data.overview), OVERVIEW_IN)
+        pages.picture(_decode(data.overview), OVERVIEW_IN)
     if data.profile is not None:
         pages.heading("Depth and altitude", PROFILE_IN)
         pages.drawing(PROFILE_IN, profile_axes, data.profile)
@@ -139,7 +139,7 @@ def _example_axes(figure: Figure, example: HeldOutExample) -> None:
     figure.suptitle(example.caption, fontsize=9.0, x=0.02, ha="left")
 
 
-def _decoded(png: bytes) -> npt.NDArray[np.uint8]:
+def _decode(png: bytes) -> npt.NDArray[np.uint8]:
     """[H, W, 4] RGBA."""
     from PIL import Image
 

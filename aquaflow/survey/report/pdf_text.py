@@ -35,7 +35,7 @@ class Pages:
     def __init__(self, pdf: PdfPages, header: str) -> None:
         """``header``: a line at the top of every page."""
         self._pdf, self._header = pdf, header
-        self._figure = self._begun()
+        self._figure = self._begin_page()
         self._y = HEIGHT_IN - MARGIN_IN
         """Inches from the bottom up to which the page is free."""
 
@@ -96,7 +96,7 @@ class Pages:
         """The page is done."""
         self._pdf.savefig(self._figure)  # type: ignore[no-untyped-call]
 
-    def _begun(self) -> Figure:
+    def _begin_page(self) -> Figure:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
@@ -110,7 +110,7 @@ class Pages:
         """Another page where this one has less room."""
         if self._y - inches < MARGIN_IN:
             self.close()
-            self._figure, self._y = self._begun(), HEIGHT_IN - MARGIN_IN
+            self._figure, self._y = self._begin_page(), HEIGHT_IN - MARGIN_IN
 
     def _text(
         self, text: str, size_pt: float, line_in: float, letters: int = LETTERS, **style: Any

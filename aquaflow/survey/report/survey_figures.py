@@ -9,7 +9,7 @@ import numpy as np
 from aquaflow.survey.coverage import COLOURS, WORDS, CoverageClass, PageView
 from aquaflow.survey.coverage.picture import cells_affine
 from aquaflow.survey.report.data import DepthProfile
-from aquaflow.survey.report.figures import INK, SUB_MAP_COLOURS, drawn, svg_of
+from aquaflow.survey.report.figures import INK, SUB_MAP_COLOURS, draw, svg_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,12 +23,12 @@ NEXT_COLOUR = "#e23ea0"
 
 def coverage_svg(view: PageView) -> str:
     """The plan view with coverage, path, lines and the next line."""
-    return svg_of(drawn(9.0, 4.6, coverage_axes, view), "coverage")
+    return svg_of(draw(9.0, 4.6, coverage_axes, view), "coverage")
 
 
 def profile_svg(profile: DepthProfile) -> str:
     """Depth and altitude over the time of the dive."""
-    return svg_of(drawn(9.0, 3.0, profile_axes, profile), "profile")
+    return svg_of(draw(9.0, 3.0, profile_axes, profile), "profile")
 
 
 def coverage_axes(figure: Figure, view: PageView) -> None:

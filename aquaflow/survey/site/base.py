@@ -36,7 +36,7 @@ def site_as_base(folder: Path) -> Base | None:
     files: dict[int, PlacesFile] = {}
     for number, (name, before) in enumerate(merged.fingerprints.items()):
         try:
-            files[number] = _unchanged(dives.get(name, folder / name), before)
+            files[number] = _check_unchanged(dives.get(name, folder / name), before)
         except InputError as error:
             log.warning("%s is left out of %s: %s", name, folder, error)
     places, origins = _places(merged, files)
@@ -54,7 +54,7 @@ def site_as_base(folder: Path) -> Base | None:
     return Base(folder, prior, tuple(places), keypoints, frames)
 
 
-def _unchanged(dive: Path, before: str) -> PlacesFile:
+def _check_unchanged(dive: Path, before: str) -> PlacesFile:
     check_unchanged(dive, before)
     return Dive(dive).places
 

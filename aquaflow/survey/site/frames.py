@@ -86,7 +86,7 @@ def log_growth(before: Sequence[Sim3], after: Sequence[Sim3]) -> float:
     return float(np.mean([np.log(b.scale / a.scale) for a, b in zip(before, after, strict=True)]))
 
 
-def scaled(T: Sim3, factor: float) -> Sim3:
+def scale(T: Sim3, factor: float) -> Sim3:
     """A pose in a world whose lengths are ``factor`` times as long, about its origin."""
     return Sim3(T.R, factor * T.t, factor * T.scale)
 

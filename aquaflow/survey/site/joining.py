@@ -54,7 +54,7 @@ def join(
     verdicts: dict[int, Verdict] = {}
     agreeing: list[tuple[list[_Placed], list[_Placed]]] = []
     for links in pairs.values():
-        kept, others = _compared(joint, links, verdicts)
+        kept, others = _compare(joint, links, verdicts)
         if kept:
             agreeing.append((kept, others))
     # The best proved first: an edge that joins two components is tested by nothing else.
@@ -90,7 +90,7 @@ def _by_sub_maps(
     return pairs
 
 
-def _compared(
+def _compare(
     joint: JointGraph, links: list[_Placed], verdicts: dict[int, Verdict]
 ) -> tuple[list[_Placed], list[_Placed]]:
     """Those that agree, and those that were not compared, of the links of two sub-maps."""

@@ -27,7 +27,7 @@ SCALE_SIGMA = 0.05
 differ by what each dive's start left wrong: against structure from motion, the scales of the links
 of two dives are 0.3 to 2.2 % off on the reef and Curasao clips, and those of one pair of dives all
 to one side. A dozen links do not average that out: 1.5 % times the root of 12. What the cameras
-moved, seen in both dives, says more of the scale (docs/sites.md#measured)."""
+moved, seen in both dives, says more of the scale (notes/sites.md#measured)."""
 ROTATION_SIGMA = 5e-4
 """rad, likewise: the rotations of links of the same dives differ by 0.1 to 0.3 degrees, with a
 stated 0.01 to 0.05."""

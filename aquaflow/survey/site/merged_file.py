@@ -77,7 +77,7 @@ class MergedSite:
         """The sub-maps of a dive."""
         return tuple(each for each in self.sub_maps if each.dive == name)
 
-    def chosen(self, component: int | None, site: Path) -> int:
+    def choose(self, component: int | None, site: Path) -> int:
         """The component that was asked for; None: the one with most keyframes.
 
         Raises:
@@ -152,7 +152,7 @@ def read_merged(site: Path) -> MergedSite | None:
             raise InputError(
                 f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow"
             )
-        return _merged(data, _keyframes(site / ARRAYS))
+        return _merge(data, _keyframes(site / ARRAYS))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
         raise InputError(
             f"cannot read {path}: {reason_of(error)}; run `aquaflow site merge` again"
@@ -180,7 +180,7 @@ def _keyframes(path: Path) -> Rows:
     return np.asarray(rows)
 
 
-def _merged(
+def _merge(
     data: dict[str, Any],
     keyframes: Rows,  # [N] KEYFRAME
 ) -> MergedSite:

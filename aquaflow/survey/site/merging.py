@@ -27,7 +27,7 @@ from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_
 from aquaflow.survey.site.links import CrossLink, find_links
 from aquaflow.survey.site.manifest import SiteDive, read_site, state_of
 from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_merged
-from aquaflow.survey.site.placing import placed
+from aquaflow.survey.site.placing import place
 from aquaflow.survey.site.site_log import say
 from aquaflow.survey.site.site_paths import write_paths
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -59,7 +59,7 @@ def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:
     try:
         taking, left_out = _taking(site, dives)
         found = _links(site, taking, progress)
-        merged = _merged(taking, left_out, found)
+        merged = _merge(taking, left_out, found)
         remove_merged(site)
         write_paths(site, {each.dive.name: each.folder for each in taking}, merged)
         write_merged(site, merged)
@@ -115,7 +115,7 @@ def _links(
     return found
 
 
-def _merged(
+def _merge(
     taking: Sequence[Taking],
     left_out: dict[str, str],
     found: dict[tuple[int, int], list[CrossLink]],
@@ -128,7 +128,7 @@ def _merged(
     ]
     joint = JointGraph(sorted(sub_maps, key=by_knowledge), files)
     judged = join(joint, found)
-    return placed(joint, [each.dive for each in taking], left_out, judged)
+    return place(joint, [each.dive for each in taking], left_out, judged)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.site.frames import Component, common_move, component_of, log_growth, scaled
+from aquaflow.survey.site.frames import Component, common_move, component_of, log_growth, scale
 from aquaflow.survey.site.joining import JudgedLink
 from aquaflow.survey.site.joint_graph import JointGraph
 from aquaflow.survey.site.manifest import SiteDive
 from aquaflow.survey.site.merged_file import KEYFRAME, MergedSite, PlacedSubMap, Rows
 
 
-def placed(
+def place(
     joint: JointGraph,
     dives: Sequence[SiteDive],
     left_out: dict[str, str],
@@ -33,7 +33,7 @@ def placed(
     return MergedSite(
         {dive.name: dive.fingerprint for dive in dives},
         left_out,
-        tuple(_stated(joint, names, each) for each in components),
+        tuple(_describe_component(joint, names, each) for each in components),
         tuple(_sub_map(joint, names, i, number_of[i], poses[i]) for i in order),
         tuple(_link(names, link) for link in judged),
         _keyframes(joint, order, number_of, poses),
@@ -55,7 +55,7 @@ def _components(joint: JointGraph) -> tuple[list[Component], list[list[Sim3]]]:
         ]
         component, factor = component_of(indices, [each.frame for each in chosen], growth)
         for index in indices:
-            poses[index] = [scaled(T, factor) for T in poses[index]]
+            poses[index] = [scale(T, factor) for T in poses[index]]
         found.append(component)
     found.sort(key=lambda each: -sum(len(joint.sub_maps[i].places) for i in each.sub_maps))
     return found, poses
@@ -72,7 +72,9 @@ def _sub_map(
     )  # fmt: skip
 
 
-def _stated(joint: JointGraph, names: Sequence[str], component: Component) -> dict[str, Any]:
+def _describe_component(
+    joint: JointGraph, names: Sequence[str], component: Component
+) -> dict[str, Any]:
     frame, reference = component.frame, joint.sub_maps[component.reference]
     origin = frame.origin
     return {

@@ -52,7 +52,7 @@ def write_site_map(
     """
     ply, about = names_of(site, component)
     about.unlink(missing_ok=True)  # it never speaks of another PLY
-    write_ply(ply, joined(gaussians))
+    write_ply(ply, join(gaussians))
     dives = [asdict(part) for part in parts]
     write_json(about, {"format": FORMAT, "component": component, "dives": dives})
 
@@ -110,7 +110,7 @@ def read_site_map(
     }
 
 
-def joined(gaussians: Sequence[PlyGaussians]) -> PlyGaussians:
+def join(gaussians: Sequence[PlyGaussians]) -> PlyGaussians:
     """All of them, one after the other."""
     means, wxyz, scales, opacities, colours = (
         np.concatenate([np.asarray(getattr(each, name), np.float32) for each in gaussians])

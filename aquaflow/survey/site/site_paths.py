@@ -26,7 +26,7 @@ def write_paths(site: Path, folders: Mapping[str, Path], merged: MergedSite) -> 
     for index, name in enumerate(merged.fingerprints):
         for component, path in _paths_of(folders[name], index, name, merged).items():
             target = site / FOLDER / f"{name}_{component}.tum"
-            _made(target.parent)
+            _make(target.parent)
             unit = merged.components[component]["unit"]
             comment = f"camera to the world of component {component} of the site; unit: {unit}"
             write_tum(target, path.t_s, path.positions, path.wxyz, comment=comment)
@@ -68,7 +68,7 @@ def _together(parts: list[Trajectory]) -> Trajectory:
     return Trajectory(t_s, positions, wxyz).select(np.argsort(t_s, kind="stable"))
 
 
-def _made(folder: Path) -> None:
+def _make(folder: Path) -> None:
     try:
         make_subfolder(folder)
     except OSError as error:

@@ -49,13 +49,13 @@ class VideoEncoder:
         whole = np.pad(picture, odd, mode="edge")
         if self._writer is None:
             self._size = (whole.shape[1], whole.shape[0])
-            self._writer = self._opened()
+            self._writer = self._open_writer()
         if (whole.shape[1], whole.shape[0]) != self._size:
             raise ValueError(f"a picture of {width} x {height} in a video of {self._size}")
         self._writer.write(np.ascontiguousarray(whole[..., ::-1]))
         self.count += 1
 
-    def _opened(self) -> cv2.VideoWriter:
+    def _open_writer(self) -> cv2.VideoWriter:
         code = cv2.VideoWriter.fourcc(*CODEC)
         writer = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, self._fps, self._size)
         if not writer.isOpened():

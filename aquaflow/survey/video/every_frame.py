@@ -21,7 +21,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View, in_time
 from aquaflow.sources import open_recording
 from aquaflow.survey.video.encoder import check_name, video_file
-from aquaflow.survey.video.overlay import marked
+from aquaflow.survey.video.overlay import mark
 from aquaflow.survey.video.timeline import Timeline, usual_fps
 from aquaflow.types import Frame
 
@@ -104,10 +104,10 @@ def restore_every_frame(
     restored, count = 0, 0
     with video_file(path, fps) as file:
         timeline = Timeline(file, fps)
-        for t_ns, frame in _recorded(dive, recording, frames, width):
+        for t_ns, frame in _read_frames(dive, recording, frames, width):
             T_wc, picture = poses.at(t_ns), frame.image
             if T_wc is None:
-                picture = marked(picture, NO_POSE)
+                picture = mark(picture, NO_POSE)
             else:
                 view = light.view(frame, T_wc)
                 seen = SeenFrame(view, picture, mapper.show(view))
@@ -121,7 +121,7 @@ def restore_every_frame(
     return EveryFrame(count, restored)
 
 
-def _recorded(
+def _read_frames(
     dive: Dive, recording: Path, frames: Sequence[FinishedFrame], width: int | None
 ) -> Iterator[tuple[int, Frame]]:
     """Every frame of the mapped part with its time on the dive's clock (ns), prepared."""

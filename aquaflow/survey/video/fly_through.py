@@ -56,7 +56,7 @@ def fly_through(
     views = in_time(mapper.views)
     count = max(round(seconds * FPS), 2)
     knots = max(round(seconds / SECONDS_PER_KNOT), LEAST_KNOTS)
-    camera = resized(views[0].camera, width)
+    camera = resize(views[0].camera, width)
     draw = Through(mapper, camera) if water else Clear(mapper, camera)
     with video_file(path, FPS) as file:
         for done, pose in enumerate(smooth_path([v.T_wc for v in views], count, knots), start=1):
@@ -66,7 +66,7 @@ def fly_through(
     return count
 
 
-def resized(camera: CameraModel, width: int | None) -> CameraModel:
+def resize(camera: CameraModel, width: int | None) -> CameraModel:
     """The camera for pictures ``width`` px wide, of the same shape; None: as it is."""
     if width is None:
         return camera
@@ -144,7 +144,7 @@ def smooth_path(poses: Sequence[Sim3], count: int, knots: int) -> list[Sim3]:
     way, places, turns = way[moved], places[moved], turns[np.flatnonzero(moved)]
     dense = np.linspace(0.0, way[-1], knots * SAMPLES_PER_KNOT)
     centres = np.stack([np.interp(dense, way, axis) for axis in places.T], axis=1)
-    quaternions = _continuous(_slerped(way, turns, dense).as_quat())
+    quaternions = _continuous(_slerp(way, turns, dense).as_quat())
     sigma = SMOOTHING_KNOTS * SAMPLES_PER_KNOT
     centres = gaussian_filter1d(centres, sigma, axis=0, mode="nearest")
     quaternions = gaussian_filter1d(quaternions, sigma, axis=0, mode="nearest")
@@ -165,7 +165,7 @@ def _way(
     return np.concatenate([[0.0], np.cumsum(steps + angles)])
 
 
-def _slerped(
+def _slerp(
     way: Array,  # [N] increasing
     turns: Rotation,
     at: Array,  # [M]

@@ -57,7 +57,7 @@ def _fitting(words: Sequence[str], px: int, room: int) -> int:
     return px if wide <= room else max(int(px * room / wide), SMALLEST_PX)
 
 
-def marked(
+def mark(
     picture: Picture,  # [H, W, 3] RGB
     word: str,
 ) -> Picture:

@@ -59,7 +59,7 @@ def side_by_side(
                 picture = to_bytes(picture_out(seen.shown.image))
             clear = without_water(mapper, seen).picture_bytes(exposure)[..., :3]
             words = words_of(frame.row.t_s, frame.known, north)
-            timeline.show(frame.row.t_s, _composed(picture, clear, left, words))
+            timeline.show(frame.row.t_s, _compose(picture, clear, left, words))
             if progress is not None:
                 progress(done, len(shown))
         timeline.end()
@@ -70,7 +70,7 @@ def _by_index(frames: list[FinishedFrame]) -> dict[int, FinishedFrame]:
     return {frame.row.index: frame for frame in frames}
 
 
-def _composed(
+def _compose(
     picture: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     clear: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     left: str,

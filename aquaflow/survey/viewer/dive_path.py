@@ -57,7 +57,7 @@ class DivePath:
         rows = [[*T.t, *T.quaternion, q] for T, q in zip(self.poses, self.quality, strict=True)]
         return np.array(rows, np.float32).reshape(-1, POSE_NUMBERS)
 
-    def thinned(self, most: int = LONGEST_PATH) -> DivePath:
+    def thin(self, most: int = LONGEST_PATH) -> DivePath:
         """Every n-th pose, so that they are at most ``most``."""
         step = max(1, -(-len(self.poses) // most))
         return self.among(range(0, len(self.poses), step))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
-from aquaflow.base.storage.dive_status import unfinished
+from aquaflow.base.storage.dive_status import unfinished_reason
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.dive import CAMERA, FRAMES, TRAJECTORY, Dive
 from aquaflow.geometry.camera import CameraModel
@@ -88,7 +88,7 @@ def finished_dive(dive: Dive, budget: int) -> FinishedDive:
     Raises:
         InputError: it is not finished.
     """
-    said = unfinished(dive.path)
+    said = unfinished_reason(dive.path)
     for name in WHOLE:
         if not dive.has(name):
             raise InputError(said or f"{dive} holds no finished dive: {name} is missing")
@@ -105,7 +105,7 @@ def finished_dive(dive: Dive, budget: int) -> FinishedDive:
 
 def note_unfinished(folder: Path) -> str:
     """What the viewer says of a dive that is shown as far as it came; empty of a finished one."""
-    said = unfinished(folder)
+    said = unfinished_reason(folder)
     return "" if said is None else f"What is shown may be of several moments: {said}"
 
 
@@ -137,7 +137,7 @@ def fill(page: ViewerPage, dive: FinishedDive) -> None:
         page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)
     else:
         page.show_splats(dive.splats, dive.water, dive.palettes)
-    path = dive.path.thinned()
+    path = dive.path.thin()
     page.show_path(path.rows, path.moments, path.began)
     page.show_pictures(path.pictures)
     if path.poses:
@@ -155,7 +155,7 @@ def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> V
     page: list[ViewerPage] = []
 
     def scale(given: Asked) -> Asked:
-        said = marked(given, mark) if mark is not None else {}
+        said = mark_coverage(given, mark) if mark is not None else {}
         if said.get("rescaled"):
             fill(page[0], finished_dive(Dive(folder), config.splats))
         return said
@@ -211,7 +211,7 @@ Mark: TypeAlias = Callable[[tuple[Place, Place], float, float], tuple[str, bool]
 it, and whether the dive's files were rescaled."""
 
 
-def marked(given: Asked, mark: Mark) -> Asked:
+def mark_coverage(given: Asked, mark: Mark) -> Asked:
     """What a browser is told of the scale bar that it asked for.
 
     Raises:

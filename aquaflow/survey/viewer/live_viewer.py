@@ -36,6 +36,9 @@ from aquaflow.types import CameraModel
 if TYPE_CHECKING:
     from aquaflow.mapping.map_copy import MapCopy  # it loads torch
 
+PICTURE_WIDTH_PX = 240
+"""px of the camera's current picture: some kB at each pose."""
+
 
 class LiveViewer(DiveView):
     """Takes new data from the loop and the maps, and shows them from its own thread."""
@@ -95,7 +98,7 @@ class LiveViewer(DiveView):
         self._path.add(latest, dive.dive_run.slam.metric_frame(latest.sub_map))
         kept = dive.dive_run.pictures
         self._pictures = {} if kept is None else kept.paths
-        step = max(1, image.shape[1] // self._config.picture_width)
+        step = max(1, image.shape[1] // PICTURE_WIDTH_PX)
         small = np.ascontiguousarray(image[::step, ::step])
         self._poses.put(ViewerPose(latest.T_wc, latest.frame.camera, small))
 
@@ -104,9 +107,9 @@ class LiveViewer(DiveView):
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            from aquaflow.mapping.map_copy import copied  # torch, which has made the map
+            from aquaflow.mapping.map_copy import copy_map  # torch, which has made the map
 
-            self._copies.put((sub_map, copied(mapper)))
+            self._copies.put((sub_map, copy_map(mapper)))
 
     def _show(self) -> None:
         pose = self._poses.take(LOOK_S)
@@ -124,7 +127,7 @@ class LiveViewer(DiveView):
         if taken is not None:
             sub_map, copy = taken
             plan = self._plan(sub_map) if self._plan is not None and self._page.watched else None
-            self._page.show_splats(*shown(copy, self._config.splats, frame, plan))
+            self._page.show_splats(*pack_for_browser(copy, self._config.splats, frame, plan))
         self._page.show_health(in_words(report))
 
 
@@ -232,7 +235,7 @@ class ViewerPose:
     """[H, W, 3] RGB"""
 
 
-def shown(
+def pack_for_browser(
     copy: MapCopy, budget: int, frame: LengthUnit | None = None, plan: CoveragePlan | None = None
 ) -> tuple[ViewerSplats, SeenWater | None, dict[str, Palette]]:
     """In the viewer's thread: what a browser gets, the water before it, and the palettes of what

@@ -61,7 +61,7 @@ class MeasuringScene:
     frame: LengthUnit
 
 
-def measured(what: str, asked: Sequence[Asked], scene: MeasuringScene) -> Asked:
+def measure(what: str, asked: Sequence[Asked], scene: MeasuringScene) -> Asked:
     """``words`` and ``quantities`` by name: distance, area or profile of what a browser asked.
 
     Raises:
@@ -72,13 +72,13 @@ def measured(what: str, asked: Sequence[Asked], scene: MeasuringScene) -> Asked:
     scale = scene.frame.scale
     if what == "distance":
         length = path_length(_points(places, sigmas, scene), scale)
-        return _said({"distance": length})
+        return _quantities_in_words({"distance": length})
     if what == "area":
         points = _points(places, sigmas, scene)
         found = {"area": area(points, scale)}
         if scene.frame.level:
             found["on a chart"] = plan_area(points, scene.up, scale)
-        return _said(found)
+        return _quantities_in_words(found)
     if what == "profile":
         return _profile(asked, places, sigmas, scene)
     raise InputError("this is neither a distance, an area nor a profile; reload the page")
@@ -136,7 +136,7 @@ def _points(
     return MeasuredPoints.round(metres * places, own, metres * RANGE_SIGMA * ranges, reach)
 
 
-def _said(quantities: dict[str, Quantity]) -> Asked:
+def _quantities_in_words(quantities: dict[str, Quantity]) -> Asked:
     names = quantities if len(quantities) > 1 else {"": next(iter(quantities.values()))}
     lines = [f"{name}: {q.in_words()}" if name else q.in_words() for name, q in names.items()]
     return {
@@ -152,7 +152,7 @@ def _profile(
     scene: MeasuringScene,
 ) -> Asked:
     """Heights of the map between the first point and the last."""
-    found = [_found(*ray) for ray in _rays(asked, ends, scene)]
+    found = [_find(*ray) for ray in _rays(asked, ends, scene)]
     seen = [each for each in found if each is not None]
     if len(seen) < 2:
         raise InputError("the map shows nothing between these points; mark others")
@@ -160,7 +160,7 @@ def _profile(
     points = _points(places, np.array([each.sigma for each in seen]), scene)
     line = profile(points, scene.up, scene.frame.scale)
     straight = path_length(_points(ends[[0, -1]], sigmas[[0, -1]], scene), scene.frame.scale)
-    said = _said({"fall or rise": line.drop, "length": straight})
+    said = _quantities_in_words({"fall or rise": line.drop, "length": straight})
     parts = {"along": line.along, "height": line.height, "low": line.low, "high": line.high}
     rounded = {name: np.round(values, 6).tolist() for name, values in parts.items()}
     missing = PROFILE_POINTS - len(seen)
@@ -190,7 +190,7 @@ def _rays(
     return [(near, p + above * scene.up, -scene.up, 0.0, width / above) for p in line]
 
 
-def _found(
+def _find(
     near: ViewerSplats,
     origin: Array,  # [3]
     direction: Array,  # [3]

@@ -3,7 +3,7 @@
 A Gaussian takes 17 bytes and one more for each of its levels, before gzip. Columns follow each
 other within a chunk (all x, all y, ...), because equal kinds of bytes compress better together:
 
-    x, y, z     uint16 each   contracted, see ``contracted``
+    x, y, z     uint16 each   contracted, see ``contract``
     rotation    4 int8        w, x, y, z of the unit quaternion with w >= 0, times 127
     scales      3 uint8       logarithm, between ``log_scales`` of the description
     opacity     uint8         times 255
@@ -107,7 +107,7 @@ class Packed:
 
     def _columns(self, part: slice) -> bytes:
         shown, code = self._splats, self._code
-        inside = contracted(shown.centres[part].astype(np.float64), code.middle, code.half)
+        inside = contract(shown.centres[part].astype(np.float64), code.middle, code.half)
         places = np.rint((inside + 2.0) * (LARGEST / 4.0)).astype("<u2")
         wxyz = shown.wxyz[part]
         turned = np.where(wxyz[:, :1] < 0.0, -wxyz, wxyz)
@@ -138,7 +138,7 @@ def chunk_ends(count: int) -> list[int]:
     return [*ends, count] if count else []
 
 
-def contracted(
+def contract(
     places: npt.NDArray[np.float64],  # [N, 3]
     middle: npt.NDArray[np.float64],  # [3]
     half: npt.NDArray[np.float64],  # [3]

@@ -67,7 +67,7 @@ def pick(
         raise InputError("the ray to pick along is none; point at the map again")
     ray = np.asarray(direction, np.float64) / length
     near = _near(splats, np.asarray(origin, np.float64), ray, beam)
-    ranges, alphas = _crossed(splats, near, np.asarray(origin, np.float64), ray, beam)
+    ranges, alphas = _intersect(splats, near, np.asarray(origin, np.float64), ray, beam)
     order = np.argsort(ranges)
     ranges, alphas = ranges[order], alphas[order]
     left = np.concatenate([[1.0], np.cumprod(1.0 - alphas)])
@@ -113,7 +113,7 @@ def _near(
     return found
 
 
-def _crossed(
+def _intersect(
     splats: ViewerSplats,
     near: npt.NDArray[np.intp],  # [M]
     origin: Array,  # [3]

@@ -37,7 +37,7 @@ class PinnedNotes:
 
     def all(self, _: Asked) -> Asked:
         """All of them."""
-        return {"notes": [_said(note) for note in read_notes(self.dive, self._frame())]}
+        return {"notes": [_note_in_words(note) for note in read_notes(self.dive, self._frame())]}
 
     def add(self, given: Asked) -> Asked:
         """One more: ``text``, ``shape`` and ``places`` of the map, and what was ``measured`` there.
@@ -58,7 +58,7 @@ class PinnedNotes:
         notes = read_notes(self.dive, frame)
         if len(notes) >= MOST_NOTES:
             raise InputError(f"a dive holds {MOST_NOTES} notes at most; remove some")
-        known = {"measured": checked} if (checked := _measured(given.get("measured"))) else {}
+        known = {"measured": checked} if (checked := _measure(given.get("measured"))) else {}
         note = Note(secrets.token_hex(6), text.strip(), shapes[shape], at, known)
         write_notes(self.dive, [*notes, note], frame)
         return {"key": note.key}
@@ -81,8 +81,8 @@ class PinnedNotes:
         return Dive(self.dive).frame
 
 
-def _measured(given: Any) -> dict[str, Any]:
-    """Quantities by name, as :func:`aquaflow.survey.viewer.measuring.measured` says them."""
+def _measure(given: Any) -> dict[str, Any]:
+    """Quantities by name, as :func:`aquaflow.survey.viewer.measuring.measure` says them."""
     found: dict[str, Any] = {}
     for name, quantity in given.items() if isinstance(given, dict) else ():
         if not isinstance(quantity, dict) or len(found) >= MOST_QUANTITIES:
@@ -94,7 +94,7 @@ def _measured(given: Any) -> dict[str, Any]:
     return found
 
 
-def _said(note: Note) -> Asked:
+def _note_in_words(note: Note) -> Asked:
     return {
         "key": note.key, "text": note.text, "shape": note.shape, "places": note.places.tolist(),
     }  # fmt: skip

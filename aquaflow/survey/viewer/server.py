@@ -68,9 +68,9 @@ class ViewerServer:
         self._server.close()
 
     def _answer(self, request: HttpRequest) -> HttpResponse:
-        return self._tool(request) if request.method == "POST" else self._looked(request)
+        return self._tool(request) if request.method == "POST" else self._answer_get(request)
 
-    def _looked(self, request: HttpRequest) -> HttpResponse:
+    def _answer_get(self, request: HttpRequest) -> HttpResponse:
         path = path_of(request.target) or ""
         shown = request.target, request.headers, request.peer
         if not self._access.allows(*shown):
@@ -81,23 +81,23 @@ class ViewerServer:
         if (file := client_file(path)) is not None:
             return _file(file, request.headers.get("if-none-match"))
         if path == "/scene.json":
-            return _said(200, self._exhibit.scene())
-        return self._data(path.split("/")[1:]) or _said(404, {"error": "there is nothing here"})
+            return _reply(200, self._exhibit.scene())
+        return self._data(path.split("/")[1:]) or _reply(404, {"error": "there is nothing here"})
 
     def _tool(self, request: HttpRequest) -> HttpResponse:
         """Its name is the path, its arguments the JSON object in the body."""
-        given = _given(request.body)
+        given = _parse_body(request.body)
         if not self._access.may_change(request.headers, request.peer):
-            return _said(403, {"error": "open the viewer with its token, and ask from its page"})
+            return _reply(403, {"error": "open the viewer with its token, and ask from its page"})
         if given is None:
-            return _said(400, {"error": "this is no request of the viewer's page"})
+            return _reply(400, {"error": "this is no request of the viewer's page"})
         try:
-            return _said(200, self._ask((path_of(request.target) or "").lstrip("/"), given))
+            return _reply(200, self._ask((path_of(request.target) or "").lstrip("/"), given))
         except InputError as error:
-            return _said(422, {"error": str(error)})
+            return _reply(422, {"error": str(error)})
         except Exception:  # whatever a browser asked for, the dive goes on
             log.exception("the viewer could not answer a request")
-            return _said(500, {"error": "that failed; the log of the viewer says why"})
+            return _reply(500, {"error": "that failed; the log of the viewer says why"})
 
     def _data(self, parts: list[str]) -> HttpResponse | None:
         """None if there is nothing by this name."""
@@ -124,7 +124,7 @@ def _file(file: ClientFile, known: str | None) -> HttpResponse:
     return _of(200, file.kind, file.packed, [*headers, GZIPPED], ASK_FIRST)
 
 
-def _given(body: bytes | None) -> dict[str, Any] | None:
+def _parse_body(body: bytes | None) -> dict[str, Any] | None:
     """The JSON object that was posted; None for anything else."""
     try:
         given = json.loads(body or b"")
@@ -133,7 +133,7 @@ def _given(body: bytes | None) -> dict[str, Any] | None:
     return given if isinstance(given, dict) else None
 
 
-def _said(code: int, said: dict[str, Any]) -> HttpResponse:
+def _reply(code: int, said: dict[str, Any]) -> HttpResponse:
     return _of(code, JSON, json.dumps(said).encode())
 
 

@@ -58,7 +58,7 @@ def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
         InputError: there is no merged site, no such component, or no dive of it that is as it was.
     """
     merged = merge_of(site)
-    chosen = merged.chosen(component, site)
+    chosen = merged.choose(component, site)
     dives = {dive.name: dive for dive in read_site(site)}
     shown, left_out = [], {}
     for name, before in merged.fingerprints.items():
@@ -66,7 +66,7 @@ def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
         if not placed:
             continue
         try:
-            shown.append(_placed(site, merged, dives.get(name), name, before, placed, budget))
+            shown.append(_place(site, merged, dives.get(name), name, before, placed, budget))
         except InputError as error:
             log.warning("%s is not shown: %s", name, error)
             left_out[name] = str(error)
@@ -87,7 +87,7 @@ def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
     return ShownSite(site, chosen, len(merged.components), tuple(shown), frame, left_out, one_map)
 
 
-def _placed(
+def _place(
     site: Path,
     merged: MergedSite,
     dive: SiteDive | None,
@@ -105,11 +105,11 @@ def _placed(
         raise InputError(f"the map of {name} is of a sub-map that is not in this component")
     read = Dive(folder)
     shown = finished_dive(read, budget)
-    path = _moved(shown.path, sub_maps_of_frames(read), placed)
+    path = _move(shown.path, sub_maps_of_frames(read), placed)
     return PlacedDive(name, shown, main.T_sn, path)
 
 
-def _moved(path: DivePath, sub_maps: Mapping[int, int], placed: Sequence[PlacedSubMap]) -> DivePath:
+def _move(path: DivePath, sub_maps: Mapping[int, int], placed: Sequence[PlacedSubMap]) -> DivePath:
     """``sub_maps``: by the microsecond of a frame."""
     T_sn = {each.number: each.T_sn for each in placed}
     inside, poses = [], []

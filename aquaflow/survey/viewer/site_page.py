@@ -14,7 +14,7 @@ from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, read_ply
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.site.site_map_file import joined, read_site_map
+from aquaflow.survey.site.site_map_file import join, read_site_map
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.survey.viewer.dive_map import DiveMap
 from aquaflow.survey.viewer.dive_path import LONGEST_PATH
@@ -92,7 +92,7 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
     covered = [each for each in classes if each is not None]
     if len(covered) == len(maps):
         levels[COVERAGE], palettes[COVERAGE] = np.concatenate(covered), CLASSES
-    all_of = joined(maps)
+    all_of = join(maps)
     cameras = np.concatenate([placed.path.places for placed in shown.dives])
     if len(cameras) and len(all_of.means):
         levels[RANGE], palettes[RANGE] = range_level(all_of.means, cameras, shown.frame.unit)
@@ -103,7 +103,7 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
 
 
 def _own_map(placed: PlacedDive) -> PlyGaussians:
-    return read_ply(placed.dive.ply).transformed(placed.T_sn)
+    return read_ply(placed.dive.ply).transform(placed.T_sn)
 
 
 def _one_map(shown: ShownSite) -> list[PlyGaussians] | None:
@@ -124,7 +124,7 @@ def _show_paths(page: ViewerPage, shown: ShownSite) -> None:
     pictures: dict[int, Path] = {}
     first = before = 0
     for placed in shown.dives:
-        path = placed.path.thinned(max(1, LONGEST_PATH // len(shown.dives)))
+        path = placed.path.thin(max(1, LONGEST_PATH // len(shown.dives)))
         own = path.moments.copy()
         own[:, PICTURE] += before
         if not _same_north(placed, shown):

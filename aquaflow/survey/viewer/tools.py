@@ -10,7 +10,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.points import MOST_POINTS
-from aquaflow.survey.viewer.measuring import Asked, LengthUnit, MeasuringScene, measured, ray_of
+from aquaflow.survey.viewer.measuring import Asked, LengthUnit, MeasuringScene, measure, ray_of
 from aquaflow.survey.viewer.picking import pick
 from aquaflow.survey.viewer.viewer_content import ShownMap, ViewerContent
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -67,7 +67,7 @@ class Tools:
         width = 1.0 if camera is None else camera.camera.width / camera.camera.fx
         cameras = exhibit.path[:, :3].astype(np.float64)
         scene = MeasuringScene(shown.splats(), cameras, width, np.array(exhibit.up), self.frame)
-        return measured(str(given.get("what")), asked, scene)
+        return measure(str(given.get("what")), asked, scene)
 
     def _map(self) -> ShownMap:
         shown = None if self.exhibit is None else self.exhibit.map

@@ -48,7 +48,7 @@ class AltitudeFactor(Factor):
     ) -> None:
         """Keeps the samples whose beam meets the map at the body's pose in ``state``; the beam
         looks along the body's z. ``path`` covers all samples."""
-        altitude = altitude.thinned(MOST_BEAMS)
+        altitude = altitude.thin(MOST_BEAMS)
         turns = TURNED * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
         mountings = [so3_exp(turn) @ state.R_bc for turn in turns]
         ranges = np.array(

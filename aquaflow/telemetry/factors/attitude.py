@@ -48,7 +48,7 @@ class TiltFactor(Factor):
     @staticmethod
     def of_attitude(attitude: Series, path: CameraPath) -> TiltFactor:
         """From an attitude filter."""
-        attitude = attitude.thinned(MOST)
+        attitude = attitude.thin(MOST)
         R_nb = rotation_from_quaternion(attitude.values)
         return TiltFactor(attitude.source, attitude.t_s, R_nb[:, 2, :], path, TILT_SIGMA)
 
@@ -80,7 +80,7 @@ class ForceFactor(TiltFactor):
         sound = (norm > LEAST_FORCE) & (norm < MOST_FORCE)
         if not sound.any():
             return None
-        force = Series(force.source, force.t_s[sound], force.values[sound]).thinned(MOST)
+        force = Series(force.source, force.t_s[sound], force.values[sound]).thin(MOST)
         down_b = -force.values / np.linalg.norm(force.values, axis=1, keepdims=True)
         return ForceFactor(force.source, force.t_s, down_b, path, FORCE_SIGMA)
 
@@ -95,7 +95,7 @@ class HeadingFactor(Factor):
 
     def __init__(self, attitude: Series, path: CameraPath) -> None:
         """``path`` covers all samples."""
-        attitude = attitude.thinned(MOST)
+        attitude = attitude.thin(MOST)
         self.source, self.t_s = attitude.source, attitude.t_s
         self.sigma = np.full(len(attitude), HEADING_SIGMA)
         self._R_bn = np.swapaxes(rotation_from_quaternion(attitude.values), 1, 2)

@@ -31,7 +31,7 @@ class DepthFactor(Factor):
 
     def __init__(self, depth: Series, path: CameraPath) -> None:
         """``path`` covers all samples."""
-        depth = depth.thinned(MOST)
+        depth = depth.thin(MOST)
         self.source, self.t_s = depth.source, depth.t_s
         self.sigma = np.full(len(depth), SIGMA_M)
         self._depth_m = depth.values[:, 0]

@@ -48,8 +48,8 @@ class Factor(ABC):
                 step = np.zeros(P)
                 step[k] = STEP
                 ahead, behind = (
-                    self.residuals(state.moved(step)),
-                    self.residuals(state.moved(-step)),
+                    self.residuals(state.move(step)),
+                    self.residuals(state.move(-step)),
                 )
                 found[..., k] = (ahead - behind) / (2.0 * STEP)
         return found

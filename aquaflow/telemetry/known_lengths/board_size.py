@@ -108,7 +108,7 @@ def board_lengths(
 def _length(group: Sequence[tuple[BoardSighting, BoardView]], sub_map: int) -> KnownLength | None:
     step = max(1.0, (len(group) - 1) / (MOST_VIEWS - 1))
     chosen = [group[round(k * step)] for k in range(min(len(group), MOST_VIEWS))]
-    fitted = _fitted([_Seen(*each) for each in chosen])
+    fitted = _fit([_Seen(*each) for each in chosen])
     if fitted is None:
         return None
     units_per_metre, sigma = fitted
@@ -150,7 +150,7 @@ class _Seen:
         return [pose for pose in poses if pose.is_finite()]
 
 
-def _fitted(seen: Sequence[_Seen]) -> tuple[float, float] | None:
+def _fit(seen: Sequence[_Seen]) -> tuple[float, float] | None:
     """Map units per metre and the relative sigma; None where it does not follow or fit."""
     if len(seen) < 2 and not seen[0].has_depth:
         return None

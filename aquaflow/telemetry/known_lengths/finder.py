@@ -67,7 +67,7 @@ class KnownLengthFinder:
             lengths += laser_lengths(self._dots, view_of, self._lasers)
         return lengths
 
-    def seen(self, view_of: Callable[[int], BoardView | None]) -> Counter[tuple[int, str]]:
+    def count_seen(self, view_of: Callable[[int], BoardView | None]) -> Counter[tuple[int, str]]:
         """Pictures with a pose that show each object, by sub-map and name."""
         found: Counter[tuple[int, str]] = Counter()
         names = [(each.frame_index, each.name) for each in self._boards]

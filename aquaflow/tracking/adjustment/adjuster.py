@@ -30,7 +30,7 @@ from aquaflow.tracking.adjustment.anchored_points import (
 from aquaflow.tracking.adjustment.joint import adjust
 from aquaflow.tracking.adjustment.window import (
     MeasuredLink,
-    copied,
+    copy,
     improvement_of,
     poses_at,
     problem_of,
@@ -176,7 +176,7 @@ class Adjuster:
         pairs: Sequence[tuple[int, int]],
         certain: bool,
     ) -> AdjustmentJob:
-        points = {n: copied(self._points[n]) for n in numbers if n in self._points}
+        points = {n: copy(self._points[n]) for n in numbers if n in self._points}
         links = {n: self._links[n] for n in numbers if n in self._links}
         views = {n: self._view(n) for n in {n for pair in pairs for n in pair}}
         found = [(views[a], views[b]) for a, b in pairs]
@@ -221,7 +221,7 @@ class Adjuster:
             if pair is not None and float(pair.valid.mean()) > LEAST_SHARE:
                 see_each_other(job.points[earlier.number], job.points[later.number], pair)
 
-    def applied(self) -> None:
+    def apply(self) -> None:
         """Keep the matches that the last job made, and count it."""
         outcome, self._outcome = self._outcome, None
         if outcome is None:

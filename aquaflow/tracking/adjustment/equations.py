@@ -77,7 +77,7 @@ class Projected:
     """[V, P, 2] normalised plane; 0 where a point is not seen."""
 
 
-def projected(
+def project(
     matches: AnchorMatches,
     poses: Sim3Batch,
     rho: Array,  # [P]
@@ -128,10 +128,12 @@ def equations_and_scores(
     rho: Array,  # [P]
 ) -> tuple[AnchorEquations, Array]:
     """The same, and [P, n] what each point adds to the gradient: as large as all the rest."""
-    at = projected(matches, poses, rho)
+    at = project(matches, poses, rho)
     by_point = _by_point(at)
-    by_view = -_moved(by_point, at.Y, rho)
-    by_anchor = _moved(by_point @ at.R[:, None], np.broadcast_to(matches.rays, at.Y.shape), rho)
+    by_view = -_point_derivatives(by_point, at.Y, rho)
+    by_anchor = _point_derivatives(
+        by_point @ at.R[:, None], np.broadcast_to(matches.rays, at.Y.shape), rho
+    )
     by_rho = np.einsum("vpij,vj->vpi", by_point, at.t)
     weights = _weights(matches, at.error)
     precision = 1.0 / matches.variance
@@ -183,7 +185,7 @@ def _by_point(at: Projected) -> Array:
     return J
 
 
-def _moved(
+def _point_derivatives(
     by_point: Array,  # [V, P, 2, 3]
     Y: Array,  # [V, P, 3] over the anchor's depth
     rho: Array,  # [P]

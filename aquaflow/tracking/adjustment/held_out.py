@@ -1,6 +1,6 @@
 """The judge of an adjustment: reprojection error of points that took no part in it.
 
-Their depths are triangulated from the poses that are judged, so no depth of a pointmap is asked.
+Their depths are triangulate from the poses that are judged, so no depth of a pointmap is asked.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     Array,
     Mask,
-    projected,
+    project,
 )
 
 REFINEMENTS = 2
@@ -27,7 +27,7 @@ def held_out_errors(matches: Sequence[AnchorMatches], poses: Sim3Batch) -> list[
     """[V, P] lengths of the errors in sigmas of every anchor; NaN where nothing is seen."""
     errors = []
     for anchor in matches:
-        error = projected(anchor, poses, triangulated(anchor, poses)).error
+        error = project(anchor, poses, triangulate(anchor, poses)).error
         size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
         errors.append(np.where(anchor.used, size, np.nan))
     return errors
@@ -69,16 +69,16 @@ def verdict(
     )
 
 
-def triangulated(matches: AnchorMatches, poses: Sim3Batch) -> Array:
+def triangulate(matches: AnchorMatches, poses: Sim3Batch) -> Array:
     """[P] inverse depths that fit the matches best, whatever the pointmap says; 0 at infinity."""
-    at = projected(matches, poses, np.zeros(len(matches.rays)))
+    at = project(matches, poses, np.zeros(len(matches.rays)))
     weight = np.where(matches.used, 1.0 / matches.sigma[:, None] ** 2, 0.0)
     seen = np.where(matches.used[..., None], matches.at, 0.0)
     way = at.t[:, None, :2] - seen * at.t[:, None, 2:]
     value = seen * at.Y[..., 2:] - at.Y[..., :2]
     rho = _ratio((weight * (way * value).sum(-1)).sum(0), (weight * (way**2).sum(-1)).sum(0))
     for _ in range(REFINEMENTS):
-        at = projected(matches, poses, rho)
+        at = project(matches, poses, rho)
         slope = at.t[:, None, :2] / at.z[..., None] - at.Y[..., :2] * (
             at.t[:, None, 2:] / (at.z**2)[..., None]
         )

@@ -9,8 +9,8 @@ import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.optimise.robust import sigma_of_lengths
-from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, projected
-from aquaflow.tracking.adjustment.held_out import HeldOutVerdict, only, triangulated, verdict
+from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, project
+from aquaflow.tracking.adjustment.held_out import HeldOutVerdict, only, triangulate, verdict
 from aquaflow.tracking.adjustment.links import Links
 from aquaflow.tracking.adjustment.solver import BundleState, descend
 from aquaflow.tracking.adjustment.uncertainty import inflation
@@ -71,7 +71,7 @@ def adjust(problem: JointProblem, iterations: int) -> JointAdjustmentResult:
     matches = [
         only(each, ~held) for each, held in zip(problem.matches, problem.held_out, strict=True)
     ]
-    state = BundleState(problem.poses, [_started(each, problem.poses) for each in matches])
+    state = BundleState(problem.poses, [_start_depths(each, problem.poses) for each in matches])
     matches = [_with_noise(each, state.poses, rho) for each, rho in _each(matches, state)]
     for number in range(ROUNDS):
         used = matches if number == 0 else [
@@ -93,12 +93,12 @@ def _each(
     return list(zip(matches, state.rho, strict=True))
 
 
-def _started(matches: AnchorMatches, poses: Sim3Batch) -> Array:
-    """[P] depths of the pointmap; triangulated where it has none."""
+def _start_depths(matches: AnchorMatches, poses: Sim3Batch) -> Array:
+    """[P] depths of the pointmap; triangulate where it has none."""
     unknown = ~np.isfinite(matches.variance)
     if not unknown.any():
         return matches.rho
-    return np.where(unknown, triangulated(matches, poses), matches.rho)
+    return np.where(unknown, triangulate(matches, poses), matches.rho)
 
 
 def _with_noise(
@@ -107,7 +107,7 @@ def _with_noise(
     rho: Array,  # [P]
 ) -> AnchorMatches:
     """The noise of every pair's matches from what is left of them; pairs of few are left out."""
-    size = np.linalg.norm(projected(matches, poses, rho).error, axis=-1)
+    size = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
     many = matches.used.sum(axis=1) >= FEW
     sigma = np.array([
         max(sigma_of_lengths(row[used]), LEAST_SIGMA) if enough else 1.0
@@ -121,6 +121,6 @@ def _without_outliers(
     poses: Sim3Batch,
     rho: Array,  # [P]
 ) -> AnchorMatches:
-    size = np.linalg.norm(projected(matches, poses, rho).error, axis=-1)
+    size = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
     near = size < OUTLIER_SIGMAS * matches.sigma[:, None]
     return replace(matches, used=matches.used & near)

@@ -19,7 +19,7 @@ from aquaflow.tracking.adjustment.equations import (
     Array,
     Mask,
     anchor_equations,
-    projected,
+    project,
 )
 from aquaflow.tracking.adjustment.links import Links
 
@@ -46,7 +46,7 @@ def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) 
     """Robust cost of all matches, and of the depths' departure from the pointmaps."""
     total = links.cost(state.poses)
     for anchor, rho in zip(matches, state.rho, strict=True):
-        error = projected(anchor, state.poses, rho).error
+        error = project(anchor, state.poses, rho).error
         size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
         total += float(KERNEL.cost(size).sum())
         total += 0.5 * float(((rho - anchor.rho) ** 2 / anchor.variance).sum())
@@ -85,7 +85,7 @@ class JointAdjustment:
 
     def linearise(self, state: BundleState) -> System:
         """The equations of a step [7 F]."""
-        system = linearised(self._matches, self._links, state, self._pattern)
+        system = linearise(self._matches, self._links, state, self._pattern)
         self._system = replace(system, cost=self.cost(state))
         return self._system
 
@@ -129,7 +129,7 @@ class System:
         return step if np.isfinite(step).all() else None
 
 
-def linearised(
+def linearise(
     matches: Sequence[AnchorMatches], links: Links, state: BundleState, pattern: BlockPattern
 ) -> System:
     """The equations of all anchors and links, summed anchor by anchor."""

@@ -16,7 +16,7 @@ from aquaflow.tracking.adjustment.equations import (
     equations_and_scores,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import BundleState, linearised
+from aquaflow.tracking.adjustment.solver import BundleState, linearise
 
 CLUSTER = 4
 """Consecutive points of an anchor, row by row, whose errors count as one draw: neighbouring matches
@@ -39,7 +39,7 @@ def covariance(
         numpy.linalg.LinAlgError: a pose is not determined at all.
     """
     pattern = BlockPattern.of(matches, links, free)
-    return np.asarray(np.linalg.inv(linearised(matches, links, state, pattern).H.toarray()))
+    return np.asarray(np.linalg.inv(linearise(matches, links, state, pattern).H.toarray()))
 
 
 def inflation(

@@ -133,6 +133,6 @@ def poses_at(
     return poses_of(snapshot.nodes[nodes])
 
 
-def copied(points: AnchoredPoints) -> AnchoredPoints:
+def copy(points: AnchoredPoints) -> AnchoredPoints:
     """A copy that another thread may add to; the arrays are shared, and never change."""
     return replace(points, seen=dict(points.seen))

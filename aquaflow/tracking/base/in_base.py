@@ -23,7 +23,7 @@ from aquaflow.keyframes.place import KeyframePlace, depths_at
 from aquaflow.prior.contract import Encoding
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.links import BaseLink, SubMapInBase, agree, link_covariance, placed
+from aquaflow.tracking.base.links import BaseLink, SubMapInBase, agree, fit_sub_map, link_covariance
 from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.tracking.loops.retrieval import Retrieval
 from aquaflow.tracking.loops.verification import Verified, verify_keypoints
@@ -108,7 +108,7 @@ class InBase:
         news, self._news = self._news, False
         return news
 
-    def moved(self) -> None:
+    def follow_moves(self) -> None:
         """Keyframes have other poses or sub-maps than before."""
         self._placed = None
 
@@ -201,7 +201,7 @@ class InBase:
         """Where each sub-map that was recognised lies in the base."""
         if self._placed is None:
             self._placed = {
-                sub_map: placed(links, [self._keyframes[link.keyframe].T_wc for link in links])
+                sub_map: fit_sub_map(links, [self._keyframes[link.keyframe].T_wc for link in links])
                 for sub_map, links in self.by_sub_map().items()
             }
         return self._placed

@@ -88,7 +88,7 @@ class SubMapInBase:
     """[7, 7] of its left tangent."""
 
 
-def placed(links: Sequence[BaseLink], poses: Sequence[Sim3]) -> SubMapInBase:
+def fit_sub_map(links: Sequence[BaseLink], poses: Sequence[Sim3]) -> SubMapInBase:
     """The similarity that fits all links best; ``poses``: T_mk of their keyframes, as they are now.
 
     Its covariance is that of the links, more where they scatter more than they state; links of

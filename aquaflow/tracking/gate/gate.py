@@ -94,9 +94,9 @@ class FrameGate:
         thumbnail = measure_thumbnail(image, mask, MIN_SNR)
         verdict = self._useless(thumbnail)
         if verdict is not None:
-            return self._bounded(verdict)
+            return self._bound(verdict)
         self._run = 0
-        verdict = self._compared(thumbnail)
+        verdict = self._compare(thumbnail)
         if verdict.passed:
             self._reference = thumbnail
             self._levels.append(thumbnail.sharpness)
@@ -127,7 +127,7 @@ class FrameGate:
             GateKind.BLURRED, f"blurred: {100 * left:.0f} % of the usual sharpness", left
         )
 
-    def _bounded(self, verdict: GateVerdict) -> GateVerdict:
+    def _bound(self, verdict: GateVerdict) -> GateVerdict:
         self._run += 1
         if self._run <= self._config.longest_run:
             return verdict
@@ -137,7 +137,7 @@ class FrameGate:
         reason = f"{verdict.reason}; {self._config.longest_run} such frames were skipped before it"
         return GateVerdict(GateKind.PASS, reason, verdict.measure)
 
-    def _compared(self, thumbnail: Thumbnail) -> GateVerdict:
+    def _compare(self, thumbnail: Thumbnail) -> GateVerdict:
         """Against the last frame that passed, so that slow drift adds up until it is seen."""
         if not self._config.skip_duplicates or self._reference is None:
             return GateVerdict(GateKind.PASS)

@@ -80,7 +80,7 @@ class Neighbourhood:
         self.local["a"], self.local["b"] = place[self.local["a"]], place[self.local["b"]]
         self.rim = (near & self.may_move & ~self.active)[self.nodes]
 
-    def grown(
+    def grow(
         self,
         wanting: Mask,  # [n] of the local poses
         reach: int,
@@ -131,7 +131,7 @@ class Descent:
             at = Equations(misfit, level)
             wanting = wanted_moves(at, around.rim) > tolerance
             if wanting.any():
-                active = around.grown(wanting, self._reach)
+                active = around.grow(wanting, self._reach)
                 self._reach *= 2
                 around, misfit = self._around(counts, active, np.zeros_like(active))
                 level, again = max(level, self._level(misfit.strain)), False
@@ -193,13 +193,13 @@ class Descent:
         for _ in range(SHORTENINGS):
             moved = (poses[moving] @ Sim3Batch.exp(share * step[moving])).on_group()
             if np.isfinite(moved.t).all() and (moved.scale > 0.0).all():
-                trial = at.misfit.moved(poses.replaced(moving, moved))
+                trial = at.misfit.move(poses.replace(moving, moved))
                 if trial.cost(level) <= limit:
-                    self._system.taken(share)
+                    self._system.note_step(share)
                     return trial, gain
             share *= SHORTER
         return None, np.inf
 
     def _keep(self, around: Neighbourhood, misfit: Misfit) -> None:
         moving = around.active[around.nodes]
-        self.poses = self.poses.replaced(around.nodes[moving], misfit.poses[moving])
+        self.poses = self.poses.replace(around.nodes[moving], misfit.poses[moving])

@@ -93,7 +93,7 @@ class Misfit:
         self.r, self.T_ba = residuals(poses, edges)
         self.chi2 = chi_squares(self.r, edges)
 
-    def moved(self, poses: Sim3Batch) -> Misfit:
+    def move(self, poses: Sim3Batch) -> Misfit:
         """The same edges at other poses."""
         return Misfit(poses, self.edges, self.allowed, self.huber)
 
@@ -126,20 +126,20 @@ class Equations:
         self._gather = sparse.csr_matrix(
             (np.ones(len(ends)), (ends, np.arange(len(ends)))), shape=(n, len(ends))
         )
-        at_b = _transposed(self._J) @ self._information @ misfit.r[:, :, None]
-        at_a = -_transposed(self._Ad) @ at_b
+        at_b = _transpose(self._J) @ self._information @ misfit.r[:, :, None]
+        at_a = -_transpose(self._Ad) @ at_b
         self.gradient: Array = self._gather @ np.concatenate([at_a, at_b])[:, :, 0]
         """[n, 7]"""
 
     @cached_property
     def H_bb(self) -> Array:
         """[m, 7, 7] block of each edge at its b."""
-        return np.asarray(_transposed(self._J) @ self._information @ self._J)
+        return np.asarray(_transpose(self._J) @ self._information @ self._J)
 
     @cached_property
     def H_ab(self) -> Array:
         """[m, 7, 7] off-diagonal block of each edge."""
-        return np.asarray(-_transposed(self._Ad) @ self.H_bb)
+        return np.asarray(-_transpose(self._Ad) @ self.H_bb)
 
     @cached_property
     def diagonal(self) -> Array:
@@ -148,7 +148,7 @@ class Equations:
         return np.asarray((self._gather @ blocks).reshape(-1, 7, 7))
 
 
-def _transposed(
+def _transpose(
     blocks: Array,  # [m, 7, 7]
 ) -> Array:
     return blocks.transpose(0, 2, 1)

@@ -72,7 +72,7 @@ class Measurements(Protocol):
         any thread."""
         ...
 
-    def applied(self) -> None:
+    def apply(self) -> None:
         """The last job's result has been taken over."""
         ...
 
@@ -96,7 +96,7 @@ class Adjustments(Protocol):
         """The adjustment of all keyframes, to be called in any thread."""
         ...
 
-    def applied(self) -> None:
+    def apply(self) -> None:
         """The last job's result has been taken over."""
         ...
 
@@ -236,7 +236,7 @@ class KeyframeGraph:
             correction = self._taken_over(result)
             for taking_part in (self._adjustments, self._telemetry):
                 if taking_part is not None:
-                    taking_part.applied()
+                    taking_part.apply()
         self._optimise(everything=self._loops_to_adjust())
         return correction
 
@@ -268,7 +268,7 @@ class KeyframeGraph:
         elif not with_telemetry:
             optimise = solve
         self._due = False
-        self._optimisation = self._worker.start(partial(self._improved, job, snapshot, optimise))
+        self._optimisation = self._worker.start(partial(self._improve, job, snapshot, optimise))
 
     def _adjustment(self, everything: bool) -> Callable[[Snapshot], Improvement] | None:
         number, self._to_adjust = self._to_adjust, None
@@ -280,7 +280,7 @@ class KeyframeGraph:
                 return None if number is None else self._adjustments.window(number)
         return None
 
-    def _improved(
+    def _improve(
         self,
         adjust: Callable[[Snapshot], Improvement] | None,
         snapshot: Snapshot,

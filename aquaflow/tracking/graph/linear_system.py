@@ -46,7 +46,7 @@ class LinearSystem:
         columns = np.concatenate([self._own, self._b, self._a])
         try:
             self._factor = splu(
-                _assembled(blocks, rows, columns, len(self._own)),
+                _assemble(blocks, rows, columns, len(self._own)),
                 permc_spec="NATURAL",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
@@ -60,17 +60,17 @@ class LinearSystem:
             return None
         gradient = np.empty((len(self._own), 7))
         gradient[self._own] = at.gradient[self._active]
-        solution = self._corrected(self._factor, gradient.ravel())
+        solution = self._correct(self._factor, gradient.ravel())
         step = np.zeros((len(self._active), 7))
         step[self._active] = solution.reshape(-1, 7)[self._own]
         return step if np.isfinite(step).all() else None
 
-    def taken(self, share: float) -> None:
+    def note_step(self, share: float) -> None:
         """Record that the last step was taken, at a share of its length."""
         if self._last is not None:
             self._last = (share * self._last[0], self._last[1])
 
-    def _corrected(
+    def _correct(
         self,
         factor: SuperLU,
         gradient: Array,  # [n]
@@ -110,7 +110,7 @@ def _ordering(
     return np.asarray(factor.perm_c, dtype=np.intp)
 
 
-def _assembled(
+def _assemble(
     blocks: Array,  # [B, 7, 7]
     rows: Index,  # [B] of blocks
     columns: Index,  # [B] of blocks

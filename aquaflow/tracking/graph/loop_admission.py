@@ -133,7 +133,7 @@ class Admission:
     """[M]"""
     config: GraphConfig
 
-    def admitted(
+    def admit(
         self,
         candidates: Index,  # [k] numbers of edges
     ) -> Admitted:
@@ -162,14 +162,14 @@ class Admission:
                 break
             for i in doubtful:
                 if tests[i].stretch(drift) <= config.loop_chi2:
-                    accepted[i] = alone or self._corroborated(loops, int(i), chains)
+                    accepted[i] = alone or self._is_corroborated(loops, int(i), chains)
         for i in doubtful[accepted[doubtful]]:
             # The loop may have to balance the chain's strain alone.
             allowed[i] = max(config.loop_chi2, tests[i].stretch(1.0))
             span[tests[i].path] = True
         return Admitted(candidates[accepted], allowed[accepted], span, quiet)
 
-    def _corroborated(
+    def _is_corroborated(
         self,
         loops: Rows,  # [k] EDGE
         i: int,

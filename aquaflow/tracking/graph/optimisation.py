@@ -44,12 +44,12 @@ class Optimisation:
         """Optimise."""
         fresh = np.arange(0 if self.everything else self.snapshot.settled, len(self.edges))
         fresh = np.union1d(self.snapshot.changed, fresh)
-        asked = self._ends(self._strained(fresh[self.counts[fresh]]))
+        asked = self._ends(self._strain(fresh[self.counts[fresh]]))
         candidates = self._candidates(fresh)
         for round_ in range(ROUNDS):
             counts = self.counts & self.links
             admission = Admission(self.descent.poses, self.edges, counts, self.config)
-            new = admission.admitted(candidates)
+            new = admission.admit(candidates)
             self.counts[new.edges], self.trust[new.edges] = True, 1.0
             self.allowed[new.edges] = new.allowed
             asked |= new.quiet
@@ -60,7 +60,7 @@ class Optimisation:
             candidates = self._to_retest(candidates, bool(new.span.any()))
         return self._result()
 
-    def _strained(
+    def _strain(
         self,
         edges: Index,  # [k] numbers of edges
     ) -> Index:
@@ -131,7 +131,7 @@ class Optimisation:
         write_poses(solved, slice(None), self.descent.poses[rows])
         touched = self.counts & (self.active[self.edges["a"]] | self.active[self.edges["b"]])
         after = self._misfit(np.flatnonzero(touched))
-        before = after.moved(poses_of(self.snapshot.nodes))
+        before = after.move(poses_of(self.snapshot.nodes))
         poses, numbers = poses_of(solved), solved["number"].tolist()
         trust = self.snapshot.trust.copy()
         trust["trust"], trust["allowed"] = self.trust, self.allowed

@@ -69,7 +69,7 @@ class BackFill:
         self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
         self._last: BackFilledFrame | None = None
 
-    def left(self, waiting: Sequence[Frame]) -> list[Frame]:
+    def waiting_frames(self, waiting: Sequence[Frame]) -> list[Frame]:
         """Those of its frames that still wait."""
         return [frame for frame in waiting if frame.index in self._indices]
 
@@ -83,13 +83,13 @@ class BackFill:
         """The frame, with its pose if it was ``placed``."""
         at = self._at
         if placed is None:
-            return Tracked.lost(frame, at.keyframe.sub_map)
+            return Tracked.as_lost(frame, at.keyframe.sub_map)
         self._last = placed
         matches = placed.solved.pair.matches
         if placed.at is not at:  # those are of another picture
             matches = expected_matches(at.keyframe.pointmap, placed.T_fk, self._camera)
         at.moved_to(placed.T_fk, matches)
-        return at.tracked(frame, FrameClass.COMMON, placed.solved.quality)
+        return at.tracked_result(frame, FrameClass.COMMON, placed.solved.quality)
 
     def _place(self, frame: Frame) -> BackFilledFrame | None:
         """At the keyframe; where the frame no longer shows that, at the frame placed before."""
@@ -155,14 +155,16 @@ class BackFills:
         if self._worker.in_step:
             return fill.all(frames)
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
-        self._left = [each for each in (*self._left, fill) if each.left(waiting)]
+        self._left = [each for each in (*self._left, fill) if each.waiting_frames(waiting)]
         return []
 
     @property
     def next(self) -> Frame | None:
         """The frame that :meth:`step` will finish next."""
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
-        return next((left[-1] for fill in self._left if (left := fill.left(waiting))), None)
+        return next(
+            (left[-1] for fill in self._left if (left := fill.waiting_frames(waiting))), None
+        )
 
     def step(self) -> list[Tracked]:
         """Finish :attr:`next`, which gets a pose or none, once that has been looked for; returns
@@ -181,10 +183,10 @@ class BackFills:
         if self._answer is not None or self._worker.waiting(STAGE):
             return
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
-        self._left = [fill for fill in self._left if fill.left(waiting)]
+        self._left = [fill for fill in self._left if fill.waiting_frames(waiting)]
         if self._left:
             fill = self._left[0]
-            frame = fill.left(waiting)[-1]
+            frame = fill.waiting_frames(waiting)[-1]
             for found in self._worker.ask(STAGE, frame.index, partial(_look_back, fill, frame)):
                 self.take(found)
 
@@ -198,7 +200,9 @@ class BackFills:
         self._answer = None
         waiting = self._waiting.move(Wait.IN_IDLE_TIME, Wait.IN_HAND)
         fills, self._left = self._left, []
-        return [tracked for fill in fills for tracked in fill.all(fill.left(waiting), until)]
+        return [
+            tracked for fill in fills for tracked in fill.all(fill.waiting_frames(waiting), until)
+        ]
 
 
 def _look_back(fill: BackFill, frame: Frame) -> BackFillResult:

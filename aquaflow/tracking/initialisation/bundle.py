@@ -65,16 +65,16 @@ def adjust(
     """Least squares with Huber weights; the scale gauge is fixed at median depth 1."""
     system = _System(pixels_reference, pixels, observed, solve_focal)
     rules = Rules(iterations, decrease=STOP_RELATIVE_DECREASE, shrinkage=0.2)
-    return system.summary(_normalised(minimise(system, _normalised(start), rules).state))
+    return system.summary(_normalise(minimise(system, _normalise(start), rules).state))
 
 
-def _normalised(bundle: Bundle) -> Bundle:
+def _normalise(bundle: Bundle) -> Bundle:
     scale = float(np.median(bundle.rho))
     views = [Sim3(T.R, T.t * scale) for T in bundle.T]
     return Bundle(views, bundle.rho / scale, bundle.camera)
 
 
-def measured(
+def is_measured(
     pixels: Array,  # [V, P, 2] px
 ) -> npt.NDArray[np.bool_]:
     """[V, P] matches that are numbers."""
@@ -127,7 +127,7 @@ class _System:
     ) -> None:
         self.pixels_reference, self.pixels = pixels_reference, pixels
         # One match that is no number would cost the whole system.
-        self.observed = observed & measured(pixels)
+        self.observed = observed & is_measured(pixels)
         self.solve_focal = solve_focal
         self._last: tuple[Bundle, tuple[Array, Array, Array]] | None = None
 

@@ -77,12 +77,12 @@ class Hypotheses:
         best = max(
             judged,
             key=lambda result: (
-                round(self._explained(result.bundle, test_frames), 2),
+                round(self._explained_share(result.bundle, test_frames), 2),
                 -result.residual_px,
             ),
         )
         self.ambiguous = any(self._is_rival(each, best) for each in judged)
-        return self._adjust(self._completed(best, test_frames), self._waiting)
+        return self._adjust(self._complete(best, test_frames), self._waiting)
 
     @staticmethod
     def _is_rival(result: BundleResult, best: BundleResult) -> bool:
@@ -95,9 +95,9 @@ class Hypotheses:
         mine, other = (_direction(each.bundle.T[far]) for each in (best, result))
         return bool(mine @ other < np.cos(np.radians(RIVAL_DEG)))
 
-    def explained(self, bundle: Bundle) -> float:
+    def explained_share(self, bundle: Bundle) -> float:
         """Share of all observations in front of their camera and within a pixel of their match."""
-        return self._explained(bundle, self._waiting)
+        return self._explained_share(bundle, self._waiting)
 
     def _test_frames(self) -> list[MatchedFrame]:
         """The pairs' frames, which have most parallax, and some of the others down to the least."""
@@ -143,10 +143,10 @@ class Hypotheses:
         for frame in test_frames:
             near = _on_the_way(T_ba, frame.parallax_px / max(second.parallax_px, 1e-6))
             known = frame is second
-            T.append(T_ba if known else self._posed(frame, camera, rho, variance, good, near))
+            T.append(T_ba if known else self._pose_frame(frame, camera, rho, variance, good, near))
         return Bundle(T, rho, camera)
 
-    def _completed(self, best: BundleResult, test_frames: list[MatchedFrame]) -> Bundle:
+    def _complete(self, best: BundleResult, test_frames: list[MatchedFrame]) -> Bundle:
         """The test frames' geometry with the poses of all waiting frames."""
         known = {id(frame): T for frame, T in zip(test_frames, best.bundle.T, strict=True)}
         rho, camera = best.bundle.rho, best.bundle.camera
@@ -156,11 +156,11 @@ class Hypotheses:
             near = min(test_frames, key=lambda near: abs(near.parallax_px - frame.parallax_px))
             own = known.get(id(frame))
             if own is None:
-                own = self._posed(frame, camera, rho, best.rho_sigma**2, sure, known[id(near)])
+                own = self._pose_frame(frame, camera, rho, best.rho_sigma**2, sure, known[id(near)])
             T.append(own)
         return Bundle(T, rho, camera)
 
-    def _posed(
+    def _pose_frame(
         self,
         frame: MatchedFrame,
         camera: CameraModel,
@@ -192,7 +192,7 @@ class Hypotheses:
         solve_focal = not start.camera.calibrated and len(frames) >= 2
         return adjust(self._pixels_reference, pixels, observed, start, solve_focal, steps)
 
-    def _explained(self, bundle: Bundle, frames: list[MatchedFrame]) -> float:
+    def _explained_share(self, bundle: Bundle, frames: list[MatchedFrame]) -> float:
         rays = bundle.camera.unproject(self._pixels_reference)
         hits, total = 0, 0
         for frame, T in zip(frames, bundle.T, strict=True):

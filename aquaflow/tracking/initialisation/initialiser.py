@@ -1,4 +1,4 @@
-"""Two-view initialisation that waits for parallax (docs/measurements.md#initialisation).
+"""Two-view initialisation that waits for parallax (notes/measurements.md#initialisation).
 
 Frames are matched to one reference until the parallax decides the geometry. Essential-matrix and
 homography poses are then compared; the best hypothesis gives the waiting frames their poses.
@@ -51,7 +51,7 @@ AS_FAR, NEAR = 0.9, 0.5
 MIN_CONFIDENCE = 0.1
 """Of a match that decides the geometry, where there are enough of them. Next to depth edges, where
 the match follows what is in front, it is below; the first keyframe's depths, bent by such matches,
-turned every link for 70 frames (docs/measurements.md#forward-views)."""
+turned every link for 70 frames (notes/measurements.md#forward-views)."""
 
 
 class Initialiser:
@@ -164,7 +164,7 @@ class Initialiser:
         camera, pixels = self.reference.camera, self._pixels_reference
         hypotheses = Hypotheses(camera, pixels, self.waiting, self._config)
         result = hypotheses.best()
-        explained = 0.0 if result is None else hypotheses.explained(result.bundle)
+        explained = 0.0 if result is None else hypotheses.explained_share(result.bundle)
         trusted = result is not None and self._trustworthy(explained, result)
         little = self.parallax_px < self._enough_px
         if little:
@@ -211,7 +211,7 @@ class Initialiser:
         return np.stack([columns + 0.5, rows + 0.5], -1)
 
 
-def calibrated(camera: CameraModel) -> CameraModel:
+def calibrate(camera: CameraModel) -> CameraModel:
     """The same camera, no longer a guess."""
     return replace(camera, calibrated=True)
 

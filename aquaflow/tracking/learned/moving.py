@@ -136,7 +136,7 @@ class _Places:
         """[h, w] pixels that the keyframe shows in other colours, wherever on its line they are."""
         assert seen.before is not None
         camera, matched = seen.camera, seen.matched[self._grid]
-        before, now = (_reduced(picture, *self.known.shape) for picture in (seen.before, seen.now))
+        before, now = (_reduce(picture, *self.known.shape) for picture in (seen.before, seen.now))
         usual = (now - _colours(before, seen.matches[self._grid], camera))[matched]
         if len(usual) == 0:
             return np.zeros_like(self.known)
@@ -153,7 +153,7 @@ class _Places:
         return np.asarray(self.known & inside & (least > DIFFERS_SIGMAS))
 
 
-def _reduced(
+def _reduce(
     picture: Picture,  # [H, W, 3]
     height: int,
     width: int,

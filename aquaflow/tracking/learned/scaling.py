@@ -77,8 +77,8 @@ def learned_depth(
     """The learned range in the unit of ``pointmap``, by the pixels that it knows to better than
     ``known_sigma``; None if they are too few, or contradict a range that is known up to a
     shift."""
-    learned = _learned(X, Q)
-    rows, columns = np.nonzero(learned & pointmap.known(known_sigma))
+    learned = _is_learned(X, Q)
+    rows, columns = np.nonzero(learned & pointmap.is_known(known_sigma))
     if len(rows) < LEAST_COMMON:
         return None
     step = -(-len(rows) // COMPARED)
@@ -88,7 +88,7 @@ def learned_depth(
         shift = shift_of(1.0 / network.z[common], pointmap.rho[common])
         if shift is None:
             return None
-        network = _shifted(network, shift)
+        network = _shift(network, shift)
         near = network.known[common]
         common = common[0][near], common[1][near]
         if len(common[0]) < LEAST_COMMON:
@@ -99,8 +99,8 @@ def learned_depth(
     A = network.A[common]
     if unit == "affine":  # by the keyframe's depths, whose errors make the line less flat
         A[:, -1] *= np.exp(log_ratio - np.median(log_ratio))
-    found, covariance, honesty = _fitted(network.sigmas, A, log_ratio, stated, own)
-    return _applied(network, found, covariance, honesty)
+    found, covariance, honesty = _fit(network.sigmas, A, log_ratio, stated, own)
+    return _apply(network, found, covariance, honesty)
 
 
 def unscaled_depth(
@@ -110,12 +110,12 @@ def unscaled_depth(
     honesty: float = 1.0,
 ) -> LearnedDepth | None:
     """The learned range in a unit that makes its median depth 1; None where nothing is known."""
-    learned = _learned(X, Q)
+    learned = _is_learned(X, Q)
     if learned.sum() < LEAST_COMMON:
         return None
     network = _network(camera, X, Q, learned)
     found = np.array([-np.log(float(np.median(network.z[learned]))), 0.0, 0.0])
-    return _applied(network, found, np.zeros((3, 3)), honesty)
+    return _apply(network, found, np.zeros((3, 3)), honesty)
 
 
 def agreement(
@@ -137,7 +137,7 @@ def agreement(
     return float(np.clip(sigma_of(left), *HONESTY))
 
 
-def _learned(
+def _is_learned(
     X: Float,  # [H, W, 3]
     Q: Float,  # [H, W]
 ) -> Mask:
@@ -175,7 +175,7 @@ def _network(
     return _Network(z, variance, _positions(camera), (np.inf, SLOPE_SIGMA, SLOPE_SIGMA))
 
 
-def _shifted(network: _Network, shift: float) -> _Network:
+def _shift(network: _Network, shift: float) -> _Network:
     """With inverse depths moved by ``shift``. Such networks err by as much of the inverse depth
     near and far, so that beyond the median depth the relative error grows with depth."""
     z = shifted_depth(network.z, shift)
@@ -193,7 +193,7 @@ def _positions(camera: CameraModel) -> Array:
     return np.stack([np.ones_like(u), u, v], -1)
 
 
-def _fitted(
+def _fit(
     sigmas: tuple[float, ...],  # [k] of the corrections before
     A: Array,  # [M, k]
     log_ratio: Array,  # [M] of the keyframe's depth over the network's
@@ -219,7 +219,7 @@ def _fitted(
     return found, covariance, honesty
 
 
-def _applied(
+def _apply(
     network: _Network,
     found: Array,  # [k] corrections
     covariance: Array,  # [k, k] of them

@@ -13,7 +13,7 @@ LOWE_RATIO = 0.8
 """Distance to the nearest over distance to the second: above, the match is not clear (Lowe)."""
 
 
-def rooted(
+def take_root(
     descriptors: Float,  # [M, d]
 ) -> Float:
     """[M, d] of unit length: signed square roots after L1 normalisation (RootSIFT).
@@ -30,7 +30,7 @@ def match_keypoints(a: Keypoints, b: Keypoints) -> tuple[Index, Index]:
     if len(a.pixels) == 0 or len(b.pixels) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     # Of unit length: the nearest is the one with the largest product.
-    product = rooted(a.descriptors) @ rooted(b.descriptors).T
+    product = take_root(a.descriptors) @ take_root(b.descriptors).T
     nearest, back = product.argmax(1), product.argmax(0)
     rows = np.arange(len(product))
     best = product[rows, nearest]

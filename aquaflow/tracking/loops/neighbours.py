@@ -11,7 +11,7 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
-from aquaflow.tracking.pose.visibility import expected, sampled
+from aquaflow.tracking.pose.visibility import is_expected, sample
 
 Array = npt.NDArray[np.float64]
 
@@ -92,7 +92,7 @@ class Neighbours:
         for i in np.argsort(distance, kind="stable")[:NEAREST]:
             keyframe, points = here[i]
             T_fk = T_fw @ keyframe.T_wc
-            neighbour = Neighbour(keyframe, T_fk, float(expected(points, T_fk, camera).mean()))
+            neighbour = Neighbour(keyframe, T_fk, float(is_expected(points, T_fk, camera).mean()))
             if neighbour.overlap >= CROWD_OVERLAP and neighbour.roll_rad < ROLL_RAD:
                 found.append(neighbour)
         return sorted(found, key=lambda neighbour: -neighbour.likeness)
@@ -100,5 +100,5 @@ class Neighbours:
 
 def sketch(keyframe: Keyframe, config: TrackingConfig) -> Array:
     """[M, 3] some points of a keyframe, in its camera frame."""
-    known = keyframe.pointmap.known(config.known_sigma)
-    return sampled(keyframe.pointmap, known, SKETCH_POINTS)[2]
+    known = keyframe.pointmap.is_known(config.known_sigma)
+    return sample(keyframe.pointmap, known, SKETCH_POINTS)[2]

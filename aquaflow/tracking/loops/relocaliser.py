@@ -41,7 +41,7 @@ class Places:
     def of_frame(self, encoding: Encoding, camera: CameraModel) -> Relocalised | None:
         """Pose of a lost frame, from the first keyframe, most similar first, that verifies."""
         for number in self._similar(encoding, ()):
-            found = self._verified(number, encoding, camera)
+            found = self._verify(number, encoding, camera)
             if found is not None:
                 return found
         return None
@@ -52,7 +52,7 @@ class Places:
         """Keyframes, but for some, that show the same place as the one with this ``encoding`` and
         ``pointmap``, with relative scale."""
         numbers = self._similar(encoding, besides)
-        found = [self._verified(n, encoding, encoding.camera, pointmap) for n in numbers]
+        found = [self._verify(n, encoding, encoding.camera, pointmap) for n in numbers]
         return [place for place in found if place is not None]
 
     def _similar(self, encoding: Encoding, besides: Container[int]) -> list[int]:
@@ -60,7 +60,7 @@ class Places:
             found = self._retrieval.candidates(encoding, besides.__contains__)
         return [candidate.number for candidate in found]
 
-    def _verified(
+    def _verify(
         self,
         number: int,
         encoding: Encoding,

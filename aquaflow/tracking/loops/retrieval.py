@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from aquaflow.config import RetrievalConfig
 from aquaflow.prior.contract import Float, HasKeypoints
-from aquaflow.tracking.loops.keypoints import rooted
+from aquaflow.tracking.loops.keypoints import take_root
 
 SEED = 0
 """The same dive gives the same words."""
@@ -123,7 +123,7 @@ class Retrieval:
     def _signature(self, encoding: HasKeypoints) -> _Signature | None:
         if self._known is not None and self._known[0] is encoding:
             return self._known[1]
-        descriptors = rooted(encoding.keypoints.descriptors)
+        descriptors = take_root(encoding.keypoints.descriptors)
         if len(descriptors) < self._config.min_descriptors:
             return None
         if self._vocabulary is None:

@@ -69,7 +69,7 @@ def verify_keypoints(
 ) -> Verified | None:
     """As :func:`verify`, of keypoints alone: ``own`` are the frame's ``keypoints`` with depths."""
     mine, theirs = match_keypoints(past.keypoints, keypoints)
-    kept = past.known(config.known_sigma)[mine]
+    kept = past.is_known(config.known_sigma)[mine]
     mine, theirs = mine[kept], theirs[kept]
     if len(mine) < config.min_inliers:
         return None
@@ -104,7 +104,7 @@ def _with_scale(
 ) -> PoseEstimate | None:
     """The similarity between the two pointmaps; None where its scale stays unknown."""
     mine, theirs = inliers
-    known = own.known(config.known_sigma)[theirs]
+    known = own.is_known(config.known_sigma)[theirs]
     if known.sum() < config.min_inliers:
         return None
     points = past.points()[mine]

@@ -97,7 +97,7 @@ class LearnedScales:
         known = {n: (log, hypot(s, self._unit_sigma)) for n, (log, s) in self._known.items()}
         return lambda better: solve_with_worlds(better, worlds_of(better, known))[0]
 
-    def applied(self) -> None:
+    def apply(self) -> None:
         """Nothing is kept of a result."""
 
 

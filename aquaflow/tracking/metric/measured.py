@@ -83,16 +83,16 @@ def world_edges(
     found = []
     for i, number in enumerate(numbers.tolist()):
         T_nk, t = estimate.frame.T_nm @ T_mk.element(i), float(t_s[i])
-        measured = _measured(T_nk, t, depth, place, scale, tilt, north)
+        measured = _measure(T_nk, t, depth, place, scale, tilt, north)
         if i == 0:
-            measured = _held(measured, T_nk, place is None, depth is None, north is None)
+            measured = _hold(measured, T_nk, place is None, depth is None, north is None)
         edge = world_edge(number, T_nk, measured)
         if edge is not None:
             found.append(edge)
     return found
 
 
-def _measured(
+def _measure(
     T_nk: Sim3,
     t_s: float,
     depth: Corrections | None,
@@ -118,7 +118,7 @@ def _measured(
     return measured
 
 
-def _held(
+def _hold(
     measured: KeyframeMeasurements, T_nk: Sim3, place: bool, depth: bool, north: bool
 ) -> KeyframeMeasurements:
     """What nothing measures anywhere is held at the first keyframe, or the world would drift."""

@@ -72,7 +72,7 @@ class LengthSightings:
         other._cameras, other._depths = dict(self._cameras), dict(self._depths)
         return other
 
-    def measured(self, place_of: PlaceOf) -> dict[int, SeenLengths]:
+    def measure(self, place_of: PlaceOf) -> dict[int, SeenLengths]:
         """What was seen, by component, measured with the poses of now."""
 
         def view_of(frame_index: int) -> BoardView | None:
@@ -83,7 +83,7 @@ class LengthSightings:
 
         lengths = self._finder.lengths(view_of)
         known = {(length.sub_map, length.source) for length in lengths}
-        seen = self._finder.seen(view_of)
+        seen = self._finder.count_seen(view_of)
         found = {component: SeenLengths([], []) for component, _ in seen}
         for length in lengths:
             found[length.sub_map].lengths.append(length)

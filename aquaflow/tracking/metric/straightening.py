@@ -62,7 +62,7 @@ class Straightened:
     """By component."""
 
 
-def straightened(
+def straighten(
     snapshot: Snapshot,
     survey: TrackingSnapshot,
     t_s: Mapping[int, float],
@@ -140,13 +140,13 @@ def _with_worlds(snapshot: Snapshot, worlds: list[World]) -> Snapshot:
     trust["trust"], trust["allowed"] = 1.0, snapshot.config.loop_chi2
     return replace(
         snapshot,
-        nodes=_joined(snapshot.nodes, nodes),
-        edges=_joined(_softened(snapshot.edges) if worlds else snapshot.edges, edges),
-        trust=_joined(snapshot.trust, trust),
+        nodes=_join(snapshot.nodes, nodes),
+        edges=_join(_soften(snapshot.edges) if worlds else snapshot.edges, edges),
+        trust=_join(snapshot.trust, trust),
     )
 
 
-def _softened(
+def _soften(
     edges: Rows,  # [M] EDGE
 ) -> Rows:
     """A copy in which links along the path have the sigmas that they have against the truth."""
@@ -161,7 +161,7 @@ def _softened(
     return soft
 
 
-def _joined(
+def _join(
     first: Rows,  # [n]
     second: Rows,  # [m] of the same dtype
 ) -> Rows:

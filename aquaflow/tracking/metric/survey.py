@@ -86,7 +86,7 @@ class TrackingSnapshot:
             T_mk, T_kf = poses_of(self.nodes[at : at + 1]), to_sim3(row["T_kf"])
             return T_mk.element(0) @ T_kf, int(self.nodes["component"][at])
 
-        return self.sightings.measured(place_of)
+        return self.sightings.measure(place_of)
 
     def ground(self, component: int) -> Array:
         """[K, 3] points of a sub-map, in its world."""
@@ -103,7 +103,7 @@ class TrackingSnapshot:
 
 def sampled_points(pointmap: Pointmap) -> Array:
     """[n, 3] well-known points of a keyframe, evenly over its picture, in its camera frame."""
-    known = np.argwhere(pointmap.known(KNOWN_SIGMA))
+    known = np.argwhere(pointmap.is_known(KNOWN_SIGMA))
     chosen = known[:: max(1, -(-len(known) // POINTS_OF_KEYFRAME))]
     if len(chosen) == 0:
         return np.zeros((0, 3))

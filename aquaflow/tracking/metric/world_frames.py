@@ -21,7 +21,7 @@ from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.sightings import LengthSightings
-from aquaflow.tracking.metric.straightening import estimates_of, straightened
+from aquaflow.tracking.metric.straightening import estimates_of, straighten
 from aquaflow.tracking.metric.survey import TrackingSnapshot, sampled_points
 from aquaflow.tracking.metric.world_edges import World
 from aquaflow.types import TelemetrySample
@@ -45,7 +45,7 @@ class EarlierDive(Protocol):
         """The earlier dive as a world of the components of the graph."""
         ...
 
-    def moved(self) -> None:
+    def follow_moves(self) -> None:
         """Keyframes have other poses or sub-maps than before."""
         ...
 
@@ -145,17 +145,17 @@ class WorldFrames:
 
         def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
-                solved = straightened(better, replace(survey, nodes=better.nodes), t_s, bases)
+                solved = straighten(better, replace(survey, nodes=better.nodes), t_s, bases)
                 self._solved = solved.frames
                 return solved.result
             return solve(better)  # what telemetry cannot do must not cost the loops
 
         return together
 
-    def applied(self) -> None:
+    def apply(self) -> None:
         """The last job's result has been taken over by the keyframes."""
         if self.base is not None:
-            self.base.moved()
+            self.base.follow_moves()
         self._take(self._solved)
 
     def update(self, snapshot: Snapshot) -> dict[int, WorldFrame]:
@@ -217,7 +217,7 @@ def motion_of_camera(
     if R_b0b1 is None:
         return None
     R_c0c1 = T_bc.R.T @ R_b0b1 @ T_bc.R
-    moved = None if metres_per_unit is None else recent.moved(first_s, last_s)
+    moved = None if metres_per_unit is None else recent.displacement(first_s, last_s)
     if moved is None or metres_per_unit is None:
         away = -(before.R.T @ before.t)  # of the camera, in its earlier axes
     else:

@@ -50,16 +50,16 @@ class OverlayFinder:
         """[H, W] what is no overlay, as far as is known by now; None: no overlay is known."""
         return self._shown
 
-    def masked(self, frame: Frame) -> Frame:
+    def mask(self, frame: Frame) -> Frame:
         """The frame with its mask limited to what is no overlay."""
-        if self._moved(frame.image):
+        if self._has_moved(frame.image):
             self._sample(frame)
         if self._shown is None:
             return frame
         shown = self._shown if frame.mask is None else self._shown & frame.mask
         return replace(frame, mask=shown)
 
-    def _moved(
+    def _has_moved(
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3]
     ) -> bool:

@@ -85,10 +85,10 @@ def overlay_regions(
             found[y : y + h, left:x] = found[y : y + h, x + w : right] = True
     side = 2 * max(1, round(MARGIN_PX * size)) + 1
     grown = cv2.dilate(found.astype(np.uint8), np.ones((side, side), np.uint8))
-    return _filled(np.asarray(grown, dtype=np.uint8))
+    return _fill(np.asarray(grown, dtype=np.uint8))
 
 
-def _filled(
+def _fill(
     found: npt.NDArray[np.uint8],  # [H, W]
 ) -> Mask:
     """With what small frames enclose."""

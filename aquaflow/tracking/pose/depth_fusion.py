@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 LEAST_CONFIDENCE = 0.005
 """Confidence that a match is given at least. Next to a depth edge it falls below a hundredth: taken
 for 0.05 there, forward views drifted by 0.3 to 0.5 % more per 100 keyframes
-(docs/measurements.md#forward-views)."""
+(notes/measurements.md#forward-views)."""
 MEASUREMENT_FLOOR = 0.01
 """Relative sigma that no single two-view depth is trusted beyond: flow errors are not independent
 from frame to frame."""
@@ -197,7 +197,7 @@ def transfer(
 ) -> Pointmap:
     """The pointmap seen from b: every reliable pixel of b takes the depth of its match in a."""
     source = source_pixels[reliable].astype(np.float64)
-    rho_a, variance_a = _interpolated(pointmap, source)
+    rho_a, variance_a = _interpolate(pointmap, source)
     known = rho_a > 1e-6
     rays = pointmap.camera.unproject(source)
     depth_b = T_ba.apply(rays / np.where(known, rho_a, 1.0)[:, None])[:, 2]
@@ -211,7 +211,7 @@ def transfer(
     return moved
 
 
-def _interpolated(
+def _interpolate(
     pointmap: Pointmap,
     pixels: Array,  # [M, 2] px
 ) -> tuple[Array, Array]:

@@ -95,7 +95,7 @@ class KeyframeMatcher:
         displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
         # What is hidden shows against depths that are right: learned ones put points elsewhere.
         triangulated = keyframe.pointmap
-        exact = known if pointmap is triangulated else triangulated.known(config.known_sigma)
+        exact = known if pointmap is triangulated else triangulated.is_known(config.known_sigma)
         visible = visibility(
             triangulated,
             keyframe.encoding.interesting & exact,
@@ -115,11 +115,11 @@ class KeyframeMatcher:
         if pointmap.learned is None:
             return pointmap
         known_sigma, least = self._config.known_sigma, LEAST_TRIANGULATED
-        triangulated = (pair.valid & pointmap.known(known_sigma)).sum()
+        triangulated = (pair.valid & pointmap.is_known(known_sigma)).sum()
         if triangulated >= least * pair.valid.sum():
             return pointmap
-        completed = pointmap.completed(known_sigma)
-        every = (pair.valid & completed.known(known_sigma)).sum()
+        completed = pointmap.complete(known_sigma)
+        every = (pair.valid & completed.is_known(known_sigma)).sum()
         return completed if triangulated < least * every else pointmap
 
     def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:

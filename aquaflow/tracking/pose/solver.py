@@ -1,7 +1,7 @@
 """Pose of a frame against a keyframe's pointmap: least squares (paper, Eq. 3).
 
 Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
-(docs/measurements.md#pose-solver); between keyframes it may be freed.
+(notes/measurements.md#pose-solver); between keyframes it may be freed.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ def solve_pose(
     if found.ending in {Ending.SINGULAR, Ending.NOT_FINITE}:
         return None
     H = descent.linearise(found.state).H
-    return _summary(len(problem.points), matches, found.state, H, *equations.left(found.state))
+    return _summary(
+        len(problem.points), matches, found.state, H, *equations.linearise_at(found.state)
+    )
 
 
 class _PoseDescent:
@@ -120,7 +122,7 @@ class RowEquations:
         cost = float(KERNEL.cost(np.abs(rows.residual)).sum(0) @ weights)
         return *_normal_equations(rows, weights), cost
 
-    def left(self, T: Sim3) -> tuple[Array, Array]:
+    def linearise_at(self, T: Sim3) -> tuple[Array, Array]:
         """Residuals [K, M] at ``T``, and what each match pulls by [n, M]: weighted J' residual."""
         rows = self._linearise(self._matches, T)
         pull = KERNEL.weight(np.abs(rows.residual)) * rows.residual * self._matches.weights

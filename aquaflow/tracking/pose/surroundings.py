@@ -35,7 +35,7 @@ def surroundings(
 ) -> tuple[Float, Mask]:
     """Inverse depth around every pixel, [H, W]; and the pixels, [H, W], whose own is known to
     better than ``relative_sigma`` of that. Where nothing is known around, it is the pixel's own."""
-    around = _mean_around(pointmap.rho.astype(np.float32), pointmap.known(relative_sigma))
+    around = _mean_around(pointmap.rho.astype(np.float32), pointmap.is_known(relative_sigma))
     known = (pointmap.rho > 1e-6) & (pointmap.variance < (relative_sigma * around) ** 2)
     return around, known
 

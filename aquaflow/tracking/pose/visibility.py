@@ -42,7 +42,7 @@ class Visibility:
     hidden. Large flakes remove matches, small ones displace them."""
 
 
-def expected(
+def is_expected(
     points: Array,  # [M, 3] in the keyframe
     T_fk: Sim3,
     camera: CameraModel,
@@ -73,8 +73,8 @@ def visibility(
 
     Where the frame should show none of them, none of them is missing.
     """
-    rows, columns, points = sampled(pointmap, looked_at, POINTS)
-    here = expected(points, T_fk, camera)
+    rows, columns, points = sample(pointmap, looked_at, POINTS)
+    here = is_expected(points, T_fk, camera)
     if not here.any():
         return Visibility(0.0, 1.0)
     rows, columns, points = rows[here], columns[here], points[here]
@@ -95,7 +95,7 @@ def evenly_taken(
     return rows, columns
 
 
-def sampled(
+def sample(
     pointmap: Pointmap,
     which: Mask,  # [H, W] pixels of known depth
     count: int,
@@ -114,7 +114,7 @@ def predicted_matches(
     otherwise: npt.NDArray[np.float32],  # [H, W, 2] px
 ) -> npt.NDArray[np.float32]:
     """[H, W, 2] px where the pose puts the keyframe's pixels; ``otherwise`` where it cannot."""
-    rows, columns, points = sampled(pointmap, known, known.size)
+    rows, columns, points = sample(pointmap, known, known.size)
     out = otherwise.copy()
     out[rows, columns] = camera.project(T_fk.apply(points))
     return out

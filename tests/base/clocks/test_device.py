@@ -132,7 +132,7 @@ def test_a_latency_that_all_messages_share_is_seen_with_round_trips_only() -> No
 
 
 def test_a_one_sided_round_trip_is_wrong_by_no_more_than_it_says() -> None:
-    """A peer that answers at once to requests that waited 20 ms (docs/measurements.md#clocks)."""
+    """A peer that answers at once to requests that waited 20 ms (notes/measurements.md#clocks)."""
     mapping = ClockMapping()
     for k in range(100):
         device_ns = k * SECOND // 10
@@ -259,7 +259,7 @@ def test_a_restarted_process_goes_on_with_what_the_one_before_knew() -> None:
         first.add(int(device_ns), int(arrival_ns))
     # The device speaks before anybody tells the new process what was known.
     second.add(int(messages.device_ns[half]), int(messages.arrival_ns[half]))
-    second.resume(json.loads(json.dumps(first.learned())))
+    second.resume(json.loads(json.dumps(first.learned_mapping())))
     second.add(int(messages.device_ns[half + 1]), int(messages.arrival_ns[half + 1]))
     report = second.report()
     assert report is not None
@@ -272,7 +272,7 @@ def test_a_restarted_process_goes_on_with_what_the_one_before_knew() -> None:
 def test_a_device_that_was_restarted_meanwhile_is_learned_anew() -> None:
     first, second = ClockMapping(), ClockMapping()
     errors_ms(first, simulated(40.0))
-    second.resume(first.learned())
+    second.resume(first.learned_mapping())
     again = simulated(40.0, seed=1)
     for device_ns, arrival_ns in zip(again.device_ns, again.arrival_ns, strict=True):
         second.add(int(device_ns), int(arrival_ns) + 100 * SECOND)

@@ -130,12 +130,12 @@ def test_a_stage_that_fails_again_and_again_is_named_until_it_works_for_a_minute
     now = [0.0]
     failures = Failures(strict=False, now_s=lambda: now[0])
     for _ in range(REPEATED):
-        assert failures.repeated() == []
+        assert failures.list_repeated() == []
         with failures.contain("water fit"):
             raise ValueError("odd")
-    assert failures.repeated() == [f"water fit failed {REPEATED} times within 60 s"]
+    assert failures.list_repeated() == [f"water fit failed {REPEATED} times within 60 s"]
     now[0] = RECENT_S + 1.0
-    assert failures.repeated() == []
+    assert failures.list_repeated() == []
 
 
 def test_a_frames_reason_is_told_once() -> None:

@@ -261,7 +261,7 @@ def test_what_is_forgotten_leaves_its_number_and_no_file(tmp_path: Path) -> None
         del things[number]
     things.save()
     assert files(tmp_path / "work") == ["000004.arrays", "let_go.txt"]
-    assert spill_of(tmp_path / "work").removed() == {0, 1, 2}  # 3 was in memory alone
+    assert spill_of(tmp_path / "work").removed_numbers() == {0, 1, 2}  # 3 was in memory alone
     with pytest.raises(KeyError):
         _ = things[0]
 

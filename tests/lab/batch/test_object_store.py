@@ -79,11 +79,11 @@ def test_an_upload_that_is_cut_off_is_no_dive_and_the_next_one_is_whole(
     with pytest.raises(StoreError):
         site.publish(dive, made_for)
     assert memory.exists("/season/site/dives/d/frames.csv")
-    assert site.finished(made_for) is None
+    assert site.finished_outcome(made_for) is None
     memory.pipe_file("/season/site/dives/d/of_an_older_attempt", b"x")
     monkeypatch.setattr(ObjectStore, "put", put)
     site.publish(dive, made_for)
-    found = site.finished(made_for)
+    found = site.finished_outcome(made_for)
     assert found is not None
     assert (found.earlier, found.frames) == (True, 3)
     assert not memory.exists("/season/site/dives/d/of_an_older_attempt")
@@ -101,17 +101,17 @@ def test_a_second_machine_that_ends_later_changes_nothing(
     late = a_dive(tmp_path / "two", made_for)
     (late / "frames.csv").write_text("another\n")
     site.publish(late, made_for)
-    found = site.finished(made_for)
+    found = site.finished_outcome(made_for)
     assert found is not None
     assert found.frames == 3
     with pytest.raises(InputError, match="other settings"):
-        site.finished(BatchJob(**{**made_for.to_json(), "settings": {"threads": 2}}))
+        site.finished_outcome(BatchJob(**{**made_for.to_json(), "settings": {"threads": 2}}))
 
 
 def test_a_damaged_manifest_is_told(memory: fsspec.AbstractFileSystem, tmp_path: Path) -> None:
     memory.pipe_file(f"/season/site/dives/d/{MANIFEST}", b"{}")
     with pytest.raises(InputError, match="damaged"):
-        open_site(SITE).finished(job(SITE, tmp_path))
+        open_site(SITE).finished_outcome(job(SITE, tmp_path))
 
 
 def test_a_store_is_listed_by_what_may_be_a_recording(memory: fsspec.AbstractFileSystem) -> None:

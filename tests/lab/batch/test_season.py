@@ -10,7 +10,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 from aquaflow.lab.batch.journal import Journal
-from aquaflow.lab.batch.season import End, Season, failed, run_season
+from aquaflow.lab.batch.season import End, Season, failed_jobs, run_season
 from aquaflow.lab.batch.workers import LocalWorkers
 from tests.lab.batch.seasons import read_journal
 
@@ -79,7 +79,7 @@ def test_a_dive_that_always_dies_is_given_up_and_the_others_are_made(
     season = run(workers, job("a"), job("b"), retries=1)
     assert workers.begun.count("a") == 2
     assert season.outcomes["b"].state == "done"
-    assert [each.name for each in failed(season, [job("a"), job("b")])] == ["a"]
+    assert [each.name for each in failed_jobs(season, [job("a"), job("b")])] == ["a"]
     assert season.outcomes["a"].sentence == "lost it was"
 
 
@@ -100,7 +100,7 @@ def test_after_a_full_disk_nothing_more_is_begun(run: Callable[..., Season]) -> 
     season = run(workers, job("a", 2), job("b", 1))
     assert workers.begun == ["a"]
     assert season.end is End.FULL_DISK
-    assert len(failed(season, [job("a"), job("b")])) == 2
+    assert len(failed_jobs(season, [job("a"), job("b")])) == 2
 
 
 @pytest.mark.parametrize(("state", "end"), [("Ctrl-C", End.STOPPED), ("gone", End.NO_WORKERS)])

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.storage.facts_file import write_facts_file
 from aquaflow.cli import app
-from aquaflow.geometry.arrays import prefixed
+from aquaflow.geometry.arrays import add_prefix
 from aquaflow.lab.bench.growth import benchmark as bm
 from aquaflow.lab.bench.growth import worker
 from aquaflow.lab.bench.growth.job import GrowthJob
@@ -110,7 +110,7 @@ def test_a_survey_is_mapped_and_looked_at(tmp_path: Path, monkeypatch: pytest.Mo
         assert told is not None
         assert isinstance(slam.maps, Maps)
         facts, arrays = slam.maps.serialise()
-        whole = prefixed("tracking", told[1]) | prefixed("mapping", arrays)
+        whole = add_prefix("tracking", told[1]) | add_prefix("mapping", arrays)
         write_facts_file(tmp_path / "true.npz", {"tracking": told[0], "mapping": facts}, whole)
         sizes.append(
             (checkpoint_bytes(slam, scratch), (tmp_path / "true.npz").stat().st_size)

@@ -14,7 +14,7 @@ from aquaflow.lab.bench.runner import KEYS
 from aquaflow.lab.bench.scene import BenchmarkScene
 from aquaflow.lab.bench.summary import COLUMNS, attenuation_error_pct
 from aquaflow.lab.bench.table import markdown
-from aquaflow.lab.bench.worker import COLOURS, RESTORED, depth_error, measured
+from aquaflow.lab.bench.worker import COLOURS, RESTORED, depth_error, measure_errors
 from aquaflow.render.image_metrics import PSNR_LIMIT_DB
 
 RUN = {"scene": "a", "preset": "fast", "peer": None, "repeat": 0, "failed": None}
@@ -47,12 +47,12 @@ def test_the_depth_error_is_relative_and_over_what_both_know(tmp_path: Path) -> 
 
 def test_the_colours_of_what_is_nearest_need_no_truth(tmp_path: Path) -> None:
     scene, folder = BenchmarkScene("a", "a"), tmp_path / "heldout"
-    assert {measured(scene, tmp_path)[key] for key in COLOURS} == {None}
+    assert {measure_errors(scene, tmp_path)[key] for key in COLOURS} == {None}
     folder.mkdir()
     for kind, bgr in (("real", (120, 130, 60)), ("restored", (60, 130, 120))):
         cv2.imwrite(str(folder / f"000008_{kind}.png"), np.full((4, 6, 3), bgr, np.uint8))
     np.savez(folder / "000008_range.npz", z=np.ones((4, 6), np.float32))
-    row = measured(scene, tmp_path)
+    row = measure_errors(scene, tmp_path)
     assert row["hue_shift_deg"] > 45.0
     assert markdown([{**dict.fromkeys(KEYS), **RUN, **row}]).count(f"{row['hue_shift_deg']:.1f}")
 
@@ -69,7 +69,7 @@ def test_restored_views_stand_next_to_what_published_methods_make_of_them(tmp_pa
         dive / "heldout" / "000000_restored.png",
     ):
         assert cv2.imwrite(str(path), picture)
-    row = measured(BenchmarkScene("tiles", "/tiles", clean=str(clean)), dive)
+    row = measure_errors(BenchmarkScene("tiles", "/tiles", clean=str(clean)), dive)
     assert set(RESTORED) <= set(row)
     assert row["restored_psnr"] == row["raw_psnr"] == PSNR_LIMIT_DB
     assert list(row["restored_peer_reasons"]) == ["sea_thru"]

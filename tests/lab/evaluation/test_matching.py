@@ -21,7 +21,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.fields import pixel_grid
 
 Picture = npt.NDArray[np.uint8]
-STILL = Distortion.scaled("still", 0.0)
+STILL = Distortion.scale("still", 0.0)
 MILD = LEVELS[0]
 
 

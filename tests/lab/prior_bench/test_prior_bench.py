@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from aquaflow import cli
 from aquaflow.base.errors import InputError
 from aquaflow.lab.prior_bench import benchmark
-from aquaflow.lab.prior_bench.latency import sea_floor, timed
+from aquaflow.lab.prior_bench.latency import measure_time, sea_floor
 from aquaflow.prior.factory import SHIPPED
 from aquaflow.prior.folder import CARD
 
@@ -52,7 +52,7 @@ def test_the_table_says_what_the_machine_was() -> None:
 
 def test_a_time_is_the_median_of_at_least_three() -> None:
     calls: list[int] = []
-    spent = timed(lambda: calls.append(0), 1)
+    spent = measure_time(lambda: calls.append(0), 1)
     assert len(calls) == 3
     assert spent.ms >= 0.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.lab.synthetic.telemetry.series import chosen, random_walk, stretches, wander
+from aquaflow.lab.synthetic.telemetry.series import choose, random_walk, stretches, wander
 
 
 def test_wandering_errors_have_their_sigma_and_correlation_time() -> None:
@@ -33,7 +33,7 @@ def test_a_walk_gains_with_the_root_of_time() -> None:
 
 
 def test_single_samples_are_chosen_independently() -> None:
-    missing = chosen(100_000, 0.02, np.random.default_rng(2))
+    missing = choose(100_000, 0.02, np.random.default_rng(2))
     assert missing.mean() == pytest.approx(0.02, rel=0.1)
     assert (missing[1:] & missing[:-1]).mean() == pytest.approx(0.02**2, rel=0.5)
 

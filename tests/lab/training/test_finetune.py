@@ -17,7 +17,13 @@ from aquaflow.base.errors import InputError
 from aquaflow.lab.training import distributed as processes
 from aquaflow.lab.training import finetune
 from aquaflow.lab.training.distributed import DistributedProcess, TrainingProcess
-from aquaflow.lab.training.finetune import FineTuning, FineTuningSettings, mined, plan_of, read_data
+from aquaflow.lab.training.finetune import (
+    FineTuning,
+    FineTuningSettings,
+    mine_pairs,
+    plan_of,
+    read_data,
+)
 from aquaflow.lab.training.mining import MinedPairs
 from aquaflow.prior.mast3r import weights
 from aquaflow.prior.mast3r.network import Mast3r
@@ -49,7 +55,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def pairs(data: Path, tmp_path: Path) -> MinedPairs:
-    return mined(
+    return mine_pairs(
         read_data([f"tartanair={data}"]), tmp_path / "index", SMALL, TrainingProcess(), silent
     )
 
@@ -108,7 +114,7 @@ def test_pictures_that_never_overlap_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path / "set", count=1)
     sequences = read_data([f"colmap={tmp_path / 'set'}"])
     with pytest.raises(InputError, match="overlap by 30 %"):
-        mined(sequences, tmp_path / "out", SMALL, TrainingProcess(), silent)
+        mine_pairs(sequences, tmp_path / "out", SMALL, TrainingProcess(), silent)
 
 
 @pytest.mark.parametrize("spec", ["tartanair", "kitti=/data", "=/data", ""])

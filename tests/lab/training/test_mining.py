@@ -17,9 +17,9 @@ from aquaflow.lab.training.datasets.posed import Frames, Posed
 from aquaflow.lab.training.datasets.tartanair import tartanair
 from aquaflow.lab.training.mining import (
     MinedPairs,
+    is_moved,
     load_index,
     mine,
-    moved,
     save_index,
     valid_pixels,
     view_of,
@@ -123,11 +123,11 @@ def test_what_moved_between_two_pictures_is_not_valid(dive: Frames) -> None:
     fish = first.depth.copy()
     fish[20:28, 30:40] = 1.0
     a, b = view_of(replace(first, depth=fish), 64, 48), view_of(second, 64, 48)
-    gone = moved(a, b)[0].numpy()
+    gone = is_moved(a, b)[0].numpy()
     assert gone[20:28, 30:40].mean() > 0.9
     gone[20:28, 30:40] = False
     assert gone.mean() < 0.02
-    assert not moved(b, a)[0].any()  # the floor is hidden by the fish there, and did not move
+    assert not is_moved(b, a)[0].any()  # the floor is hidden by the fish there, and did not move
 
 
 def test_a_list_of_pairs_comes_back_and_a_damaged_one_is_named(

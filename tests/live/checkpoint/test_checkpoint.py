@@ -20,7 +20,7 @@ from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
-from aquaflow.live.checkpoint.resume import choose, is_begun, resumed
+from aquaflow.live.checkpoint.resume import choose, is_begun, resume_folder
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.health.http import exposition
@@ -51,7 +51,7 @@ class Cut:
 def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cut]:
     recording, folder = open_recording(small_recording), tmp_path_factory.mktemp("dives") / "cut"
     frames = [frame for frame in recording.frames(stop=20) if isinstance(frame, Frame)]
-    dive = LiveDive("cut", resumed(folder, new=False), ToldFeed(), VEHICLE)
+    dive = LiveDive("cut", resume_folder(folder, new=False), ToldFeed(), VEHICLE)
     for frame in frames[:CUT]:
         dive.parts.loop.take(frame)
     caught_up(dive)
@@ -67,7 +67,7 @@ def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 @pytest.fixture(scope="module")
 def back(cut: Cut) -> Iterator[LiveDive]:
-    dive = LiveDive("cut", resumed(cut.folder, new=False), ToldFeed(), VEHICLE)
+    dive = LiveDive("cut", resume_folder(cut.folder, new=False), ToldFeed(), VEHICLE)
     dive.folder._lock.release()  # further tests look at the folder as nobody's
     yield dive
     dive.close()
@@ -285,7 +285,7 @@ def test_a_checkpoint_waits_for_a_search_of_loops_and_a_frame_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken, go_on = list[bool](), Event()
-    with LiveDive("new", resumed(tmp_path / "new", new=False), ToldFeed(), VEHICLE) as dive:
+    with LiveDive("new", resume_folder(tmp_path / "new", new=False), ToldFeed(), VEHICLE) as dive:
         worker, checkpointer = dive.parts.slam.worker, dive.parts.checkpointer
         worker.ask(LOOP_SEARCH, 0, lambda: go_on.wait(60.0))
         checkpointer.take_soon()

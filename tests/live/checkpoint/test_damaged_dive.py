@@ -13,7 +13,7 @@ from aquaflow.base.storage.facts_file import write_facts_file
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.live.checkpoint.generations import previous_file, read_state, state_file
-from aquaflow.live.onboard import OnboardSettings, begun
+from aquaflow.live.onboard import OnboardSettings, begin_dive
 from aquaflow.types import Frame
 from tests.command_line import Cli, refused
 from tests.live.damaged_dives import Outcome, gone_on_with, killed_dive, many, readable
@@ -145,7 +145,7 @@ def test_pictures_of_another_width_are_refused_before_anything_is_changed(dive: 
     before = {path: path.read_bytes() for path in dive.rglob("*") if path.is_file()}
     wider = VehicleConfig.model_validate(VEHICLE.model_dump() | {"source": {"width": 64}})
     with pytest.raises(ConfigError, match=r"begun with source.width the default .* with 64; give"):
-        begun(ToldFeed(), wider, OnboardSettings(dive))
+        begin_dive(ToldFeed(), wider, OnboardSettings(dive))
     assert {path: path.read_bytes() for path in dive.rglob("*") if path.is_file()} == before
 
 

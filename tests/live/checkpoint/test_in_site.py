@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config.vehicle import looking_in
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
 from aquaflow.sources import open_recording
@@ -31,7 +31,7 @@ def cut(
     """A dive of the same place, up to its checkpoint, as a process that was killed leaves it."""
     folder = tmp_path_factory.mktemp("dives") / "cut"
     frames = open_recording(small_recording).frames(stop=16)
-    dive = LiveDive("cut", resumed(folder, new=False), ToldFeed(), looking_in(VEHICLE, base))
+    dive = LiveDive("cut", resume_folder(folder, new=False), ToldFeed(), looking_in(VEHICLE, base))
     for frame in frames:
         assert isinstance(frame, Frame)
         dive.parts.loop.take(frame)
@@ -52,7 +52,7 @@ def test_the_pilot_is_told_that_the_place_was_found(cut: LiveDive) -> None:
 
 
 def test_a_dive_that_goes_on_is_in_the_site_without_being_asked_again(cut: LiveDive) -> None:
-    with LiveDive("cut", resumed(cut.folder.path, new=False), ToldFeed(), VEHICLE) as back:
+    with LiveDive("cut", resume_folder(cut.folder.path, new=False), ToldFeed(), VEHICLE) as back:
         old, new = cut.parts.slam, back.parts.slam
         assert old.in_base is not None
         assert new.in_base is not None
@@ -69,7 +69,9 @@ def test_a_dive_that_goes_on_is_in_the_site_without_being_asked_again(cut: LiveD
 def test_a_dive_keeps_its_place_in_a_site_that_is_gone(cut: LiveDive, base: Path) -> None:
     away = base.rename(base.with_name("away"))
     try:
-        with LiveDive("cut", resumed(cut.folder.path, new=False), ToldFeed(), VEHICLE) as back:
+        with LiveDive(
+            "cut", resume_folder(cut.folder.path, new=False), ToldFeed(), VEHICLE
+        ) as back:
             assert back.parts.slam.metric_frame(0).site == "yesterday"
             notes = " ".join(back.parts.run.notes)
             assert "keeps its place there" in notes
@@ -79,6 +81,6 @@ def test_a_dive_keeps_its_place_in_a_site_that_is_gone(cut: LiveDive, base: Path
 
 def test_a_site_that_cannot_be_read_costs_itself_and_not_the_dive(tmp_path: Path) -> None:
     vehicle = looking_in(VEHICLE, tmp_path / "nowhere")
-    with LiveDive("new", resumed(tmp_path / "dive", new=True), ToldFeed(), vehicle) as dive:
+    with LiveDive("new", resume_folder(tmp_path / "dive", new=True), ToldFeed(), vehicle) as dive:
         assert dive.parts.slam.in_base is None
         assert any("is no folder" in note for note in dive.parts.run.notes)

@@ -23,7 +23,7 @@ from aquaflow.live.checkpoint.generations import (
     state_file,
     write_state,
 )
-from aquaflow.live.checkpoint.resume import Choice, choose, resumed, tidy
+from aquaflow.live.checkpoint.resume import Choice, choose, resume_folder, tidy
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.onboard import map_live
@@ -98,7 +98,7 @@ def test_a_checkpoint_of_another_version_is_left_alone(tmp_path: Path) -> None:
     write_state(tmp_path / "old", {"format": FORMAT - 1, "version": "0.0.9"}, {})
     with pytest.raises(OtherFormatError, match=r"version 0\.0\.9"):
         read_state(state_file(tmp_path / "old"))
-    assert resumed(tmp_path / "old", new=False).folder == tmp_path / "old-2"
+    assert resume_folder(tmp_path / "old", new=False).folder == tmp_path / "old-2"
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"\x80\x04pickle"])
@@ -108,7 +108,7 @@ def test_a_damaged_checkpoint_is_left_alone_and_the_next_dive_is_beside(
     file = state_file(tmp_path / "old")
     file.parent.mkdir(parents=True)
     file.write_bytes(damage)
-    assert resumed(tmp_path / "old", new=False).folder == tmp_path / "old-2"
+    assert resume_folder(tmp_path / "old", new=False).folder == tmp_path / "old-2"
     choice = choose(tmp_path, CheckpointConfig(), new=False, now=ClockReading.now())
     assert choice.checkpoint is None
     assert choice.folder != tmp_path / "old"
@@ -117,7 +117,7 @@ def test_a_damaged_checkpoint_is_left_alone_and_the_next_dive_is_beside(
 @pytest.mark.parametrize("told", ["the recording ended", "stop requested"])
 def test_only_a_dive_that_was_told_to_stop_can_be_resumed(tmp_path: Path, told: str) -> None:
     feed = ToldFeed()
-    dive = LiveDive("dive", resumed(tmp_path / "dive", new=False), feed, VEHICLE)
+    dive = LiveDive("dive", resume_folder(tmp_path / "dive", new=False), feed, VEHICLE)
     for name in ("work", "checkpoint"):
         (tmp_path / "dive" / name).mkdir()
     if told == "stop requested":

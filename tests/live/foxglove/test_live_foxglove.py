@@ -28,11 +28,11 @@ from aquaflow.config.service import FoxgloveConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
-from aquaflow.dive.ros.definitions import encoded
-from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.dive.ros.definitions import encode
+from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.foxglove.live import LiveFoxglove
-from aquaflow.live.foxglove.map_moment import cloud_of, taken
+from aquaflow.live.foxglove.map_moment import cloud_of, take_map_moment
 from aquaflow.live.foxglove.server import BACKLOG, FoxgloveServer
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
@@ -105,12 +105,12 @@ def live(
     recording = open_recording(small_recording)
     frames = [frame for frame in recording.frames() if isinstance(frame, Frame)][:12]
     config = FoxgloveConfig(enabled=True, port=0, pose_hz=60.0, refresh_s=0.01, points=200)
-    with LiveDive("live", resumed(folder, new=False), ToldFeed(), VEHICLE) as dive:
+    with LiveDive("live", resume_folder(folder, new=False), ToldFeed(), VEHICLE) as dive:
         loop, begun_ns = dive.parts.loop, time.time_ns()
         foxglove = LiveFoxglove(config, lambda: report(dive.parts, 1e6))
         loop.watchers.append(foxglove.update)
         listener = Listener(example, foxglove.port)
-        until(lambda: foxglove._server.wanted(topics.POINTS))
+        until(lambda: foxglove._server.is_wanted(topics.POINTS))
         try:
             for frame in frames:
                 loop.take(replace(frame, arrival_ns=time.monotonic_ns()))
@@ -196,10 +196,10 @@ def test_diagnostics_say_the_state_and_its_reason(live: SimpleNamespace) -> None
 def test_a_moment_of_the_map_has_only_what_was_asked_for(live: SimpleNamespace) -> None:
     mapper = live.dive.parts.maps.mappers[0]
     frame = live.dive.parts.slam.metric_frame(0)
-    nothing = taken(mapper, 0, frame, points=False, pictures=False)
+    nothing = take_map_moment(mapper, 0, frame, points=False, pictures=False)
     assert nothing.rendered is None
     assert cloud_of(nothing, 100) is None
-    some = taken(mapper, 0, frame, points=True, pictures=True)
+    some = take_map_moment(mapper, 0, frame, points=True, pictures=True)
     assert some.rendered is not None
     points = cloud_of(some, 100)
     assert points is not None
@@ -228,14 +228,14 @@ def test_a_slow_client_loses_messages_and_no_other_does(
     number = next(c["id"] for c in channels if c["topic"] == topics.CAMERA)
     wanted = [{"id": 1, "channelId": number}]
     slow.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-    until(lambda: server.wanted(topics.CAMERA))
+    until(lambda: server.is_wanted(topics.CAMERA))
     large = messages.jpeg(0, "x", np.zeros((8, 8, 3), np.uint8))
     large.data = np.zeros(4_000_000, np.uint8)
     count = 8 * BACKLOG
     for t_ns in range(count):  # 1 GB: neither the sockets nor the backlog hold it
         server.send(topics.CAMERA, t_ns, large)
     quick = Listener(example, server.port)
-    until(lambda: server.wanted(topics.TF))
+    until(lambda: server.is_wanted(topics.TF))
     small = messages.transforms(count, [])
     until(lambda: bool(quick.received[topics.TF]), lambda: server.send(topics.TF, count, small))
     quick.close()
@@ -256,10 +256,10 @@ def test_what_nobody_has_asked_for_is_not_encoded(
     server: FoxgloveServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[object] = []
-    monkeypatch.setattr("aquaflow.live.foxglove.server.encoded", asked.append)
+    monkeypatch.setattr("aquaflow.live.foxglove.server.encode", asked.append)
     server.send(topics.CAMERA, 1, BIG)
     assert asked == []
-    assert not server.wanted(topics.CAMERA)
+    assert not server.is_wanted(topics.CAMERA)
 
 
 def test_an_address_that_is_taken_is_one_sentence(server: FoxgloveServer) -> None:
@@ -347,14 +347,14 @@ def test_the_example_node_hands_messages_on_byte_for_byte(
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    until(lambda: server.wanted(topics.TF_STATIC) and server.wanted(topics.CAMERA))
+    until(lambda: server.is_wanted(topics.TF_STATIC) and server.is_wanted(topics.CAMERA))
     static = messages.transforms(5, [])
     server.send(topics.TF_STATIC, 5, static)
     server.send(topics.CAMERA, 6, BIG)
     until(lambda: len(published) == 2)
     connection.close()
     thread.join(GIVE_UP_S)
-    assert published == {topics.TF_STATIC: [encoded(static)], topics.CAMERA: [encoded(BIG)]}
+    assert published == {topics.TF_STATIC: [encode(static)], topics.CAMERA: [encode(BIG)]}
     assert made == {
         topics.TF_STATIC: ("class of tf2_msgs/msg/TFMessage", "transient local"),
         topics.CAMERA: ("class of sensor_msgs/msg/CompressedImage", "volatile"),

@@ -8,7 +8,7 @@ import pytest
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.config.service import ListenConfig
-from aquaflow.config.stage import validated
+from aquaflow.config.stage import validate
 from aquaflow.web.access import MOST_ADDRESSES, Access
 
 TOKEN = "correct-horse-battery"
@@ -32,7 +32,7 @@ def token_file(tmp_path: Path) -> Path:
 def trusting(token_file: Path) -> Access:
     network = ["192.168.2.0/24", "fd00::/8"]
     config = {"host": "0.0.0.0", "port": 8230, "token_file": token_file, "trusted": network}
-    return Access(validated(ListenConfig, config, "test"))
+    return Access(validate(ListenConfig, config, "test"))
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_only_a_proxy_of_the_config_states_its_clients(trusting: Access, token_f
         "host": "0.0.0.0", "port": 8230, "token_file": token_file,
         "trusted": ["192.168.2.0/24"], "proxies": ["127.0.0.1"],
     }  # fmt: skip
-    behind = Access(validated(ListenConfig, config, "test"))
+    behind = Access(validate(ListenConfig, config, "test"))
     assert behind.allows("/health", stated, "127.0.0.1")
     assert not behind.allows("/health", stated, "127.0.0.2")
     assert not behind.allows("/health", stated | {"x-real-ip": "10.0.0.5"}, "127.0.0.1")
@@ -77,9 +77,9 @@ def test_only_a_proxy_of_the_config_states_its_clients(trusting: Access, token_f
 
 def test_a_trusted_network_still_asks_for_a_token_file_and_a_real_network() -> None:
     with pytest.raises(ConfigError, match="token_file"):
-        validated(ListenConfig, {"host": "0.0.0.0", "port": 1, "trusted": ["10.0.0.0/8"]}, "test")
+        validate(ListenConfig, {"host": "0.0.0.0", "port": 1, "trusted": ["10.0.0.0/8"]}, "test")
     with pytest.raises(ConfigError, match="trusted"):
-        validated(ListenConfig, {"port": 1, "trusted": ["192.168.2.300"]}, "test")
+        validate(ListenConfig, {"port": 1, "trusted": ["192.168.2.300"]}, "test")
 
 
 def test_cookies_of_other_services_of_the_vehicle_hide_ours_in_no_way(careful: Access) -> None:

@@ -71,11 +71,11 @@ def test_the_silent_stage_is_found_and_a_retired_one_is_not() -> None:
     heartbeats.beat("mapping")
     clock.pass_(50.0)
     heartbeats.beat("tracking")
-    assert heartbeats.hung(60.0) is None
+    assert heartbeats.find_hung_stage(60.0) is None
     clock.pass_(20.0)
-    assert heartbeats.hung(60.0) == "mapping"
+    assert heartbeats.find_hung_stage(60.0) == "mapping"
     heartbeats.retire("mapping")
-    assert heartbeats.hung(60.0) is None
+    assert heartbeats.find_hung_stage(60.0) is None
 
 
 def test_the_watchdog_ends_the_process_of_a_hung_stage() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.config.service import ListenConfig, ServiceConfig
-from aquaflow.config.stage import validated
+from aquaflow.config.stage import validate
 from aquaflow.live.health.http import HealthServer
 from aquaflow.web.access import Access, read_token
 from tests.command_line import Cli
@@ -156,7 +156,7 @@ def test_clients_that_hang_keep_nobody_else_out(server: HealthServer) -> None:
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.2.2", "::", "vehicle.local"])
 def test_no_socket_beyond_loopback_without_a_token(host: str) -> None:
     with pytest.raises(ConfigError, match="token_file"):
-        validated(ServiceConfig, {"health": {"host": host, "port": 8230}}, "test")
+        validate(ServiceConfig, {"health": {"host": host, "port": 8230}}, "test")
 
 
 def test_a_token_that_others_may_read_or_guess_is_refused(token_file: Path) -> None:

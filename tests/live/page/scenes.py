@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from aquaflow.survey.coverage import PageView
-from aquaflow.survey.coverage.live_coverage import described
+from aquaflow.survey.coverage.live_coverage import describe
 from aquaflow.survey.coverage.picture import cells_png, coverage_png
 from aquaflow.web import HttpRequest, HttpResponse
 from tests.live.health.reports import REPORT
@@ -90,7 +90,7 @@ class SimulatedDive:
             "up": "magnetic north", "points": points,
         }  # fmt: skip
         now = {"sub_map": 0, "at": points[-1], "ahead": [1.0, 0.1]}
-        seen = {} if self.coverage is None else {"coverage": described(self.coverage)}
+        seen = {} if self.coverage is None else {"coverage": describe(self.coverage)}
         hints = [] if self.coverage is None else ["too fast for the wanted overlap: 41 %"]
         return {"sub_maps": [plan | seen], "now": now, "hints": hints}
 
@@ -135,9 +135,9 @@ def with_buttons(answers: type[Any], dive: SimulatedDive) -> type[Any]:
                 return HttpResponse(200, "image/jpeg", dive.picture())
             return super().data(path)
 
-        def posted(self, request: HttpRequest) -> HttpResponse:
+        def answer_post(self, request: HttpRequest) -> HttpResponse:
             if not request.target.startswith("/dive/"):
-                return super().posted(request)
+                return super().answer_post(request)
             if not self.access.allows(request.target, request.headers, request.peer):
                 return HttpResponse(403, "application/json", b'{"error": "give the token"}')
             code, said = dive.act(request.target.rpartition("/")[2])

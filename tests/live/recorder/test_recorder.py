@@ -146,8 +146,8 @@ def test_missing_pictures_keep_their_place(tmp_path: Path) -> None:
 
 def test_how_a_camera_is_mounted_comes_back_from_every_file(tmp_path: Path) -> None:
     recorder, down = Recorder(tmp_path, LOSSLESS), MountingConfig(pitch_deg=-90.1)
-    recorder.mounted("c", down)
-    recorder.mounted("other", None)
+    recorder.record_mounting("c", down)
+    recorder.record_mounting("other", None)
     recorder.frame("c", picture(0))
     recorder.frame("other", picture(0))
     recorder.close()

@@ -65,7 +65,7 @@ def test_arming_begins_a_dive_and_disarming_finishes_it_after_a_while() -> None:
     assert set(vehicle.seconds(5, armed=True)) == {DivePhase.MAPPING}
     assert set(vehicle.seconds(10, armed=False)) == {DivePhase.MAPPING}
     assert set(vehicle.seconds(3, armed=False)) == {DivePhase.FINISHING}
-    vehicle.control.ended()
+    vehicle.control.end_dive()
     assert set(vehicle.seconds(30, armed=False)) == {DivePhase.IDLE}
 
 
@@ -81,7 +81,7 @@ def test_a_dive_that_the_pilot_finished_is_not_begun_anew_before_the_next_arming
     vehicle = Vehicle()
     vehicle.seconds(2, armed=True)
     vehicle.control.ask(ServiceRequest.FINISH)
-    vehicle.control.ended()
+    vehicle.control.end_dive()
     assert set(vehicle.seconds(5, armed=True) + vehicle.seconds(1, armed=False)) == {DivePhase.IDLE}
     assert set(vehicle.seconds(2, armed=True)) == {DivePhase.MAPPING}
 
@@ -91,7 +91,7 @@ def test_who_is_armed_while_a_dive_is_being_finished_gets_the_next_one() -> None
     vehicle.seconds(2, armed=True)
     vehicle.seconds(12, armed=False)
     assert set(vehicle.seconds(3, armed=True)) == {DivePhase.FINISHING}
-    vehicle.control.ended()
+    vehicle.control.end_dive()
     assert set(vehicle.seconds(3, armed=True)) == {DivePhase.MAPPING}
 
 
@@ -107,7 +107,7 @@ def test_a_dive_begun_after_the_disarming_is_not_finished_by_it() -> None:
     vehicle = Vehicle()
     vehicle.seconds(2, armed=True)
     vehicle.control.ask(ServiceRequest.FINISH)
-    vehicle.control.ended()
+    vehicle.control.end_dive()
     vehicle.seconds(3, armed=False)
     vehicle.control.ask(ServiceRequest.START)
     assert set(vehicle.seconds(30, armed=False)) == {DivePhase.MAPPING}

@@ -10,6 +10,9 @@ import torch
 
 from aquaflow.config import InsertionConfig
 from aquaflow.mapping.gaussians.insertion import (
+    COVERED_ALPHA,
+    MAX_SPACING_WIDTHS,
+    SCALE_OF_SPACING,
     insertion_probability,
     new_gaussians,
     select,
@@ -76,7 +79,7 @@ def test_structure_that_only_the_map_has_asks_for_nothing() -> None:
 
 
 def test_the_map_covers_from_the_configured_alpha_on() -> None:
-    alpha = torch.full(SIZE, CONFIG.covered_alpha)
+    alpha = torch.full(SIZE, COVERED_ALPHA)
     assert not insertion_probability(FLAT, FLAT, alpha, CONFIG).any()
     assert insertion_probability(FLAT, FLAT, alpha - 0.01, CONFIG).all()
 
@@ -160,7 +163,7 @@ def test_sparser_pixels_get_wider_gaussians_up_to_a_limit() -> None:
     widths = [float(born([5], [5], z, P=P)["log_scales"][0, 0].exp()) for P in (1.0, 0.3, 0.1)]
     assert widths == sorted(widths)
     assert widths[0] < 0.6 * widths[-1]
-    limit = CONFIG.scale_of_spacing * CONFIG.max_spacing_widths * CAMERA.width / CAMERA.fx
+    limit = SCALE_OF_SPACING * MAX_SPACING_WIDTHS * CAMERA.width / CAMERA.fx
     rare = born([5], [5], z, P=0.0)["log_scales"][0, 0].exp()
     assert float(rare) == pytest.approx(limit, rel=1e-4)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from aquaflow.mapping.neural.decode import (
     DECODED,
-    decoded,
+    decode,
     decoded_torch,
     in_picture,
     without_residuals,
@@ -52,7 +52,7 @@ class Case:
         self.pull = {name: scene.normal(*scene.parameters[name].shape) for name in DECODED}
 
     def compiled(self, threads: int = 1) -> dict[str, Tensor]:
-        return decoded(self.decoder, self.trunk, self.parameters, self.places, CENTRE, threads)
+        return decode(self.decoder, self.trunk, self.parameters, self.places, CENTRE, threads)
 
     def defined(self) -> dict[str, Tensor]:
         centre = CENTRE.to(self.hidden.dtype)

@@ -140,7 +140,7 @@ def test_what_is_inserted_into_a_trained_map_looks_as_it_was_given() -> None:
     mapper.gaussians.extend(new, 0)
     centre = torch.tensor([0.1, 0.0, -0.2])
     decoder.insert(centre, 5)
-    baked = decoder.baked(centre.expand(before + 5, 3))
+    baked = decoder.bake_parameters(centre.expand(before + 5, 3))
     for name in DECODED:
         torch.testing.assert_close(baked[name][before:], new[name], rtol=0, atol=1e-5)
 
@@ -149,13 +149,13 @@ def test_a_sub_map_that_is_absorbed_keeps_its_looks() -> None:
     first, second = grown(neural(), seed=0), grown(neural(), seed=1)
     for mapper in (first, second):
         mapper.optimise(16)
-    baked = second.scene.baked(second.views)
+    baked = second.scene.bake_parameters(second.views)
     count = len(second.gaussians)
     views = list(second.views)
     first.absorb(second)
     assert is_whole(first)
     assert second.neural is None
-    seen = first.scene.neural.baked(first.scene.nearest_cameras(views)[0])  # type: ignore[union-attr]
+    seen = first.scene.neural.bake_parameters(first.scene.nearest_cameras(views)[0])  # type: ignore[union-attr]
     for name in DECODED:
         torch.testing.assert_close(seen[name][-count:], baked[name], rtol=0, atol=1e-4)
 

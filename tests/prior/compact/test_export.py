@@ -20,7 +20,7 @@ from aquaflow.prior.compact.export import (
     LICENCE_WITH_PICTURES,
     OUTPUTS,
     export,
-    folded,
+    fold,
     load_checkpoint,
     parity_of,
 )
@@ -64,7 +64,7 @@ def prepared(image: npt.NDArray[np.uint8]) -> Picture:
 
 def test_folding_the_normalisation_changes_nothing() -> None:
     network, picture = small(), torch.rand(1, 3, 48, 64)
-    frozen = folded(network)
+    frozen = fold(network)
     with torch.no_grad():
         for one, other in zip(network.encode(picture), frozen.encode(picture), strict=True):
             assert torch.allclose(one, other, atol=1e-5)

@@ -49,8 +49,8 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
 
 
 def compared(describer: Mast3rDescriber):  # type: ignore[no-untyped-def]
-    a, b = (describer.features(describer.fitted(picture)) for picture in pictures())
-    return describer.compared(a, b, TALL, TALL)
+    a, b = (describer.features(describer.fit(picture)) for picture in pictures())
+    return describer.compare(a, b, TALL, TALL)
 
 
 def test_cells_ranges_and_confidence_are_those_of_the_picture_alone(
@@ -65,8 +65,8 @@ def test_cells_ranges_and_confidence_are_those_of_the_picture_alone(
 
 def test_cells_lie_where_the_picture_is_in_the_frame(describer: Mast3rDescriber) -> None:
     pair = compared(describer)
-    tokens = [describer.features(describer.fitted(picture)) for picture in pictures()]
-    D = describer.decoded(*tokens)["D_a"][0]
+    tokens = [describer.features(describer.fit(picture)) for picture in pictures()]
+    D = describer.decode(*tokens)["D_a"][0]
     band = (FRAME[0] - CELLS[0] * CELL_PX) // 2 // CELL_PX * CELL_PX
     np.testing.assert_array_equal(pair.cells[0][0, 0], D[band + CELL_PX // 2, CELL_PX // 2])
 
@@ -76,7 +76,7 @@ def test_each_way_is_decoded_once(
 ) -> None:
     asked = []
     decoded = describer.decoded
-    monkeypatch.setattr(describer, "decoded", lambda *ab: asked.append(1) or decoded(*ab))
+    monkeypatch.setattr(describer, "decode", lambda *ab: asked.append(1) or decoded(*ab))
     pair = compared(describer)
     for _ in range(2):
         _ = pair.cells, pair.range_a, pair.range_b, pair.confidence
@@ -96,7 +96,7 @@ def test_confidence_that_is_no_number_takes_no_weight(
     found = {"C_a": np.full((1, *FRAME), 2.0, np.float32)}
     found["C_a"][0, 20:30] = bad
     found["C_a"][0, :, 44:] = 0.5
-    monkeypatch.setattr(describer, "decoded", lambda a, b: found)
+    monkeypatch.setattr(describer, "decode", lambda a, b: found)
     confidence = compared(describer).confidence
     assert set(np.unique(confidence)) == {0.25, 1.0}
     found["C_a"][:] = bad

@@ -76,7 +76,7 @@ def test_the_papers_network_tells_cells_apart_behind_the_hybrid_prior(folder: Pa
     image = np.random.default_rng(0).integers(0, 256, (64, 96, 3)).astype(np.uint8)
     a, b = prior.encode(image, camera), prior.encode(image, camera)
     assert isinstance(a, HybridEncoding)
-    cells, same = a.describer.compared(a.features, b.features, camera, camera).cells
+    cells, same = a.describer.compare(a.features, b.features, camera, camera).cells
     assert cells.shape == same.shape == (HEIGHT // 8, WIDTH // 8, TINY.descriptor)
     np.testing.assert_allclose(np.linalg.norm(cells, axis=-1), 1.0, atol=1e-4)
     pair = prior.decode(a, b)

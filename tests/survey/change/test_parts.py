@@ -12,7 +12,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.change.frames import in_site, on_earth, read_transform
 from aquaflow.survey.change.registration import register
-from aquaflow.survey.change.relief import best_shift, filled, hull_of
+from aquaflow.survey.change.relief import best_shift, fill, hull_of
 from aquaflow.survey.change.significance import discoveries, measured_spread, null_spread, two_sided
 from aquaflow.telemetry.world_frame import WorldFrame
 
@@ -105,7 +105,7 @@ def test_holes_of_heights_are_filled_and_hulls_hold_their_cells() -> None:
     heights = np.add.outer(np.arange(5.0), np.arange(5.0))
     holes = heights.copy()
     holes[2, 2] = np.nan
-    np.testing.assert_allclose(filled(holes), heights)
+    np.testing.assert_allclose(fill(holes), heights)
     mask = np.zeros((7, 7), bool)
     mask[1, 1] = mask[5, 1] = mask[1, 5] = True
     hull = hull_of(mask)

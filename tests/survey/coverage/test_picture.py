@@ -13,7 +13,7 @@ from aquaflow.survey.coverage.picture import (  # fmt: skip
     HEIGHT,
     NEXT,
     WIDTH,
-    _fitted,
+    _fit,
     cells_affine,
     cells_png,
     coverage_png,
@@ -36,7 +36,7 @@ def test_the_finished_picture_has_every_classs_colour_and_the_next_line() -> Non
 
 
 def test_each_pixel_of_the_plan_has_the_class_of_its_place() -> None:
-    pixels, fit = decoded(coverage_png(VIEW)), _fitted(VIEW)
+    pixels, fit = decoded(coverage_png(VIEW)), _fit(VIEW)
     corner, off = VIEW.path[0] + [0.4, 0.2], VIEW.path[0] - [4.0, 0.0]
     for place in (corner, off):
         x, y = fit.px(place).astype(int)

@@ -12,7 +12,7 @@ from aquaflow.dive.posed_views import PosedView
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.mesh.blocks import Blocks
-from aquaflow.survey.export.mesh.fusion import fused
+from aquaflow.survey.export.mesh.fusion import fuse
 from aquaflow.survey.export.mesh.surface import SurfaceBuilder
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, surface_layers, unit_rays
@@ -90,5 +90,5 @@ def fused_mesh(surfaces: ViewSurfaces, voxel: float = VOXEL, least_views: int = 
     """All chunks of a surface."""
     builder = SurfaceBuilder(voxel)
     for chunk in Blocks(surfaces, voxel).chunks():
-        builder.add(chunk, fused(surfaces, chunk, voxel, least_views))
+        builder.add(chunk, fuse(surfaces, chunk, voxel, least_views))
     return builder.mesh()

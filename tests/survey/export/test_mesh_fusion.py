@@ -10,7 +10,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.survey.export.mesh import blocks as blocks_module
 from aquaflow.survey.export.mesh import colouring
-from aquaflow.survey.export.mesh.atlas import lay_out, painted
+from aquaflow.survey.export.mesh.atlas import lay_out, paint
 from aquaflow.survey.export.mesh.blocks import Blocks, truncation
 from aquaflow.survey.export.mesh.colouring import look_at
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
@@ -160,7 +160,7 @@ def test_a_texture_has_the_colours_of_its_places_up_to_its_seams(
         return np.clip(127.0 * (places + 1.0), 0, 255).astype(np.uint8), places[:, 2] < 0.99
 
     layout = lay_out(sphere, VOXEL)
-    picture = painted(sphere, layout, colour)
+    picture = paint(sphere, layout, colour)
     assert picture.shape == (layout.height, layout.width, 3)
     np.testing.assert_array_equal(layout.source[layout.faces], sphere.faces)
     corners = layout.places[layout.faces].mean(axis=1).astype(int)

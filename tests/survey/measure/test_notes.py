@@ -11,7 +11,14 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.earth import latitude_longitude
-from aquaflow.survey.measure.notes import MOST_NOTES, NAME, Note, read_notes, scaled, write_notes
+from aquaflow.survey.measure.notes import (
+    MOST_NOTES,
+    NAME,
+    Note,
+    read_notes,
+    scale_notes,
+    write_notes,
+)
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import TRONDHEIM, metric_frame
 
@@ -80,7 +87,7 @@ def test_notes_grow_with_a_dive_that_becomes_metric(tmp_path: Path) -> None:
     metric = metric_frame(**LOCAL)
     with pytest.raises(InputError, match="is in map units, and the dive in m"):
         read_notes(tmp_path, metric)
-    write_notes(tmp_path, scaled(read_notes(tmp_path, WorldFrame.unknown()), 2.5), metric)
+    write_notes(tmp_path, scale_notes(read_notes(tmp_path, WorldFrame.unknown()), 2.5), metric)
     np.testing.assert_allclose(read_notes(tmp_path, metric)[0].places, [[30.0, -18.75, 23.125]])
 
 

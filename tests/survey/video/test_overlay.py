@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.survey.video.overlay import GROUND, INK, MARK, band, marked, words_of
+from aquaflow.survey.video.overlay import GROUND, INK, MARK, band, mark, words_of
 
 ROW = PoseRow(
     7, 83.456, datetime(2026, 11, 22, 13, 3, 5, tzinfo=timezone.utc), 0, 0.0, 0.0, 0.0, "m",
@@ -45,7 +45,7 @@ def test_a_band_is_as_wide_as_the_picture_and_its_words_do_not_touch(width: int)
 
 def test_a_mark_covers_a_corner_only() -> None:
     picture = np.full((90, 160, 3), 120, np.uint8)
-    found = marked(picture, "no pose")
+    found = mark(picture, "no pose")
     changed = (found != picture).any(axis=2)
     assert changed[:5, :5].all()
     assert changed.mean() < 0.15

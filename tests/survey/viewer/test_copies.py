@@ -10,7 +10,7 @@ import numpy as np
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.map_copy import MapCopy
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
-from aquaflow.survey.viewer.live_viewer import shown
+from aquaflow.survey.viewer.live_viewer import pack_for_browser
 
 
 def copied(count: int) -> MapCopy:
@@ -26,12 +26,12 @@ def copied(count: int) -> MapCopy:
 
 def test_gaussians_are_coloured_by_the_plan_of_their_sub_map() -> None:
     plan: Any = SimpleNamespace(classes_of=lambda places: np.where(places[:, 0] > 0.0, 3, 1))
-    splats, _, palettes = shown(copied(50), 50, plan=plan)
+    splats, _, palettes = pack_for_browser(copied(50), 50, plan=plan)
     assert palettes[COVERAGE] == CLASSES
     assert np.array_equal(splats.levels[COVERAGE], np.where(splats.centres[:, 0] > 0.0, 3, 1))
 
 
 def test_without_a_plan_no_coverage_is_shown() -> None:
-    splats, _, palettes = shown(copied(50), 50)
+    splats, _, palettes = pack_for_browser(copied(50), 50)
     assert COVERAGE not in palettes
     assert COVERAGE not in splats.levels

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aquaflow.survey.viewer.levels import range_level
-from aquaflow.survey.viewer.packing import FIRST_CHUNK, Packed, chunk_ends, contracted
+from aquaflow.survey.viewer.packing import FIRST_CHUNK, Packed, chunk_ends, contract
 from aquaflow.survey.viewer.seen_water import water_of
 from aquaflow.survey.viewer.splats import ViewerSplats, splats
 
@@ -118,7 +118,7 @@ def test_the_same_map_has_the_same_address_and_another_one_another() -> None:
 
 def test_positions_are_contracted_without_a_jump() -> None:
     x = np.linspace(-30.0, 30.0, 2001)[:, None].repeat(3, axis=1)
-    y = contracted(x, np.zeros(3), np.ones(3))
+    y = contract(x, np.zeros(3), np.ones(3))
     assert (np.diff(y, axis=0) > 0.0).all()
     assert np.abs(y).max() < 2.0
     assert np.allclose(y[np.abs(x) <= 1.0], x[np.abs(x) <= 1.0])

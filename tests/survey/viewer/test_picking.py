@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.viewer.measuring import LengthUnit, MeasuringScene, measured, ray_of
+from aquaflow.survey.viewer.measuring import LengthUnit, MeasuringScene, measure, ray_of
 from aquaflow.survey.viewer.picking import pick, within_reach
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.viewer.planes import DEPTH, floor
@@ -89,7 +89,7 @@ def test_rays_in_a_plane_need_few_gaussians_and_meet_the_same() -> None:
 
 
 def test_two_points_are_a_distance_with_its_sigma() -> None:
-    said = measured("distance", [point(0.0, 0.0), point(3.0, 0.0)], scene())
+    said = measure("distance", [point(0.0, 0.0), point(3.0, 0.0)], scene())
     length = said["quantities"]["distance"]
     assert np.isclose(length["value"], 3.0, atol=0.03)
     assert 0.0 < length["sigma"] < 0.3
@@ -101,14 +101,14 @@ def test_lengths_of_a_live_map_are_said_in_metres_once_they_are_known() -> None:
     ends = [point(0.0, 0.0), point(3.0, 0.0)]
     live = LengthUnit(Scale("m", 0.01, 0.0), metres=2.0)
     assert np.isclose(
-        measured("distance", ends, scene(live))["quantities"]["distance"]["value"], 6.0, atol=0.06
+        measure("distance", ends, scene(live))["quantities"]["distance"]["value"], 6.0, atol=0.06
     )
-    unknown = measured("distance", ends, scene(LengthUnit.of(WorldFrame.unknown())))
+    unknown = measure("distance", ends, scene(LengthUnit.of(WorldFrame.unknown())))
     assert "map units" in unknown["words"]
 
 
 def test_three_points_are_an_area() -> None:
-    said = measured("area", [point(0, 0), point(2, 0), point(2, 2), point(0, 2)], scene())
+    said = measure("area", [point(0, 0), point(2, 0), point(2, 2), point(0, 2)], scene())
     assert np.isclose(said["quantities"]["area"]["value"], 4.0, atol=0.05)
     assert set(said["quantities"]) == {"area", "on a chart"}
 
@@ -116,7 +116,7 @@ def test_three_points_are_an_area() -> None:
 @pytest.mark.parametrize("level", [True, False])
 def test_a_profile_of_a_plane_is_flat(level: bool) -> None:
     frame = LengthUnit(Scale("m", 0.0, 0.0), level=level)
-    said = measured("profile", [point(-2.0, 1.0), point(2.0, 1.0)], scene(frame))
+    said = measure("profile", [point(-2.0, 1.0), point(2.0, 1.0)], scene(frame))
     line = said["profile"]
     assert len(line["along"]) == len(line["height"]) == 64
     assert np.isclose(line["along"][-1], 4.0, atol=0.05)
@@ -133,11 +133,11 @@ def test_a_profile_of_a_plane_is_flat(level: bool) -> None:
 )  # fmt: skip
 def test_a_point_that_is_none_is_refused_in_a_sentence(bad: dict[str, Any]) -> None:
     with pytest.raises(InputError):
-        measured("distance", [point(0, 0), point(1, 0) | bad], scene())
+        measure("distance", [point(0, 0), point(1, 0) | bad], scene())
 
 
 def test_what_is_no_measurement_is_refused() -> None:
     with pytest.raises(InputError, match="neither a distance"):
-        measured("weight", [point(0, 0), point(1, 0)], scene())
+        measure("weight", [point(0, 0), point(1, 0)], scene())
     with pytest.raises(InputError, match="three finite numbers"):
         ray_of({"origin": [0, 0, 0], "direction": "ahead", "pixel_rad": 0.001})

@@ -44,16 +44,16 @@ def test_one_keyframe_gives_a_length_once_its_depth_was_kept() -> None:
     sightings.look(3, picture(), CAMERA)
     place = in_map(VIEW).T_wc, 5
     # A larger board further away looks the same.
-    assert sightings.measured({3: place}.get)[5].lengths == []
-    (report,) = sightings.measured({3: place}.get)[5].unknown
+    assert sightings.measure({3: place}.get)[5].lengths == []
+    (report,) = sightings.measure({3: place}.get)[5].unknown
     assert (report.source, report.kind, report.used) == ("marker 7", "length", 0)
     assert "(1)" in report.reason
     sightings.keep_depths(3, pointmap)
-    (length,) = sightings.measured({3: place}.get)[5].lengths
-    assert sightings.measured({3: place}.get)[5].unknown == []
+    (length,) = sightings.measure({3: place}.get)[5].lengths
+    assert sightings.measure({3: place}.get)[5].unknown == []
     assert (length.source, length.sub_map) == ("marker 7", 5)
     assert length.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=0.03)
-    assert sightings.measured({}.get) == {}
+    assert sightings.measure({}.get) == {}
 
 
 def test_a_copy_does_not_grow() -> None:

@@ -14,10 +14,10 @@ from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     anchor_equations,
     equations_and_scores,
-    projected,
+    project,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import BundleState, cost_of, linearised
+from aquaflow.tracking.adjustment.solver import BundleState, cost_of, linearise
 from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
 
 STEP = 1e-6
@@ -69,7 +69,7 @@ def test_residuals_move_as_their_derivatives_say(moved: int) -> None:
     def errors(size: float) -> Array:
         steps = np.zeros((3, 7))
         steps[moved] = size * d
-        return projected(matches, poses @ Sim3Batch.exp(steps), rho).error
+        return project(matches, poses @ Sim3Batch.exp(steps), rho).error
 
     slope = (errors(STEP) - errors(-STEP)) / (2 * STEP)
     at = list(matches.places).index(moved)
@@ -101,7 +101,7 @@ def test_links_pull_as_their_cost_says() -> None:
         root @ root.transpose(0, 2, 1),
     )
     free = np.ones(3, dtype=bool)
-    system = linearised([], links, BundleState(poses, []), BlockPattern.of([], links, free))
+    system = linearise([], links, BundleState(poses, []), BlockPattern.of([], links, free))
     H, gradient = system.H, system.gradient
     step = rng.normal(size=(3, 7))
 
@@ -120,7 +120,7 @@ def test_poses_that_are_held_are_no_unknowns() -> None:
     state = BundleState(problem.poses, known.rho)
     free = np.array([False, True, False, True])
     pattern = BlockPattern.of(problem.matches, no_links(), free)
-    system = linearised(problem.matches, no_links(), state, pattern)
+    system = linearise(problem.matches, no_links(), state, pattern)
     assert system.H.shape == (14, 14)
     assert system.gradient.shape == (14,)
 
@@ -137,7 +137,7 @@ def test_sums_of_blocks_are_those_of_a_dense_matrix() -> None:
         H[np.ix_(at, at)] += part.H
         gradient[at] += part.gradient
     pattern = BlockPattern.of(problem.matches, no_links(), free)
-    system = linearised(problem.matches, no_links(), state, pattern)
+    system = linearise(problem.matches, no_links(), state, pattern)
     own = np.flatnonzero(np.repeat(free, 7))
     assert np.allclose(system.H.toarray(), H[np.ix_(own, own)], rtol=1e-12, atol=1e-9)
     assert np.allclose(system.gradient, gradient[own], rtol=1e-12, atol=1e-9)

@@ -15,7 +15,7 @@ from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     anchor_equations,
 )
-from aquaflow.tracking.adjustment.held_out import triangulated, verdict
+from aquaflow.tracking.adjustment.held_out import triangulate, verdict
 from aquaflow.tracking.adjustment.joint import adjust
 from aquaflow.tracking.adjustment.uncertainty import covariance
 from tests.tracking.adjustment.adjustment_scenes import NOISE, Array, apart, scene, shaken
@@ -108,7 +108,7 @@ def test_depths_are_triangulated_whatever_the_pointmap_says() -> None:
     known = scene(noise=0.0)
     wrong = replace(known.matches[2], rho=5.0 * known.rho[2])
     seen = wrong.used.any(axis=0)
-    found = triangulated(wrong, Sim3Batch.of(known.poses))
+    found = triangulate(wrong, Sim3Batch.of(known.poses))
     np.testing.assert_allclose(found[seen], known.rho[2][seen], rtol=1e-6)
 
 

@@ -18,7 +18,7 @@ from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.in_base import InBase
-from aquaflow.tracking.base.links import BaseLink, agree, link_covariance, placed
+from aquaflow.tracking.base.links import BaseLink, agree, fit_sub_map, link_covariance
 from tests.tracking.tracking_scenes import KnownView
 
 CAMERA = CameraModel(4, 3, 4.0, 4.0, 2.0, 1.5)
@@ -130,7 +130,9 @@ def test_links_that_scatter_more_than_they_state_place_the_dive_less_surely() ->
     moved = [Sim3(T_SM.R, T_SM.t + 0.1 * (-1) ** n, T_SM.scale) for n in range(6)]
     loud = [link_of(number, moved[number]) for number in range(6)]
     poses = [pose_of(number) for number in range(6)]
-    assert placed(loud, poses).covariance[0, 0] > 2.0 * placed(quiet, poses).covariance[0, 0]
+    assert (
+        fit_sub_map(loud, poses).covariance[0, 0] > 2.0 * fit_sub_map(quiet, poses).covariance[0, 0]
+    )
 
 
 def test_the_metric_frame_of_the_base_is_that_of_the_dive() -> None:

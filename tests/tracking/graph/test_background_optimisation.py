@@ -92,7 +92,7 @@ class Drifting:
 
     def close_loops(self, wait: bool = False) -> None:
         """Those that were found since."""
-        for each in self.worker.finished(wait):
+        for each in self.worker.take_finished(wait):
             if each.found is not None:
                 self.graph.close_loops(each.found)
 

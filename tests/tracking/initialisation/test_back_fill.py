@@ -102,7 +102,7 @@ def test_a_frame_of_the_past_is_looked_for_beside_tracking(clip: list[Frame]) ->
     assert tracker.back_fill() == tracker.back_fill() == Step()
     assert tracker.past is not None
     go_on.set()
-    _, looked_back = worker.finished(wait=True)
+    _, looked_back = worker.take_finished(wait=True)
     tracker.looked_back(looked_back.found)
     (placed,) = tracker.back_fill().frames
     assert placed.frame.index == newest - 1

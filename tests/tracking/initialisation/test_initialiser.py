@@ -14,7 +14,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.tracking.initialisation import initialiser as initialiser_module
 from aquaflow.tracking.initialisation.hypotheses import Hypotheses
-from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated
+from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrate
 from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, depth_map, pose
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
@@ -336,7 +336,7 @@ def test_waiting_frames_are_thinned_and_none_is_forgotten() -> None:
 
 
 def test_a_calibrated_camera_differs_from_its_guess_only_in_saying_so() -> None:
-    assert calibrated(GUESS) == replace(GUESS, calibrated=True)
+    assert calibrate(GUESS) == replace(GUESS, calibrated=True)
 
 
 def test_one_wide_step_that_shows_less_than_half_of_the_reference_decides_a_geometry() -> None:

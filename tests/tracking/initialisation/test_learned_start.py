@@ -72,8 +72,8 @@ def pair(sigma: float = 0.05, stated: float = 0.05, T_ba: Sim3 = STILL) -> Range
 def test_two_pictures_without_parallax_give_a_map() -> None:
     start = learned_start(pair(), SMALL, STARTING)
     assert start is not None
-    assert not start.pointmap.known(1.0).any(), "nothing is triangulated yet"
-    depth = 1.0 / start.pointmap.completed(1.0).rho
+    assert not start.pointmap.is_known(1.0).any(), "nothing is triangulated yet"
+    depth = 1.0 / start.pointmap.complete(1.0).rho
     assert np.median(depth) == pytest.approx(1.0)
     truth = plane_depth(Sim3.identity())
     ratio = depth / truth
@@ -129,7 +129,9 @@ def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
     assert tracked.tracked[0].frame.index == 0
     assert tracked.store[0].frame_index == 0
     assert error_share(tracked.tracked, poses) < 0.02
-    assert tracked.store[0].pointmap.known(0.15).mean() > 0.5, "most of it is triangulated by then"
+    assert tracked.store[0].pointmap.is_known(0.15).mean() > 0.5, (
+        "most of it is triangulated by then"
+    )
 
 
 def test_ranges_up_to_a_shift_fill_the_map_once_something_is_triangulated() -> None:
@@ -144,6 +146,6 @@ def test_ranges_up_to_a_shift_fill_the_map_once_something_is_triangulated() -> N
     first = tracked.store[0].pointmap
     assert first.learned is not None
     depth = plane_depth(Sim3.identity())
-    known, learned = first.known(0.15), first.learned.rho > 0.0
+    known, learned = first.is_known(0.15), first.learned.rho > 0.0
     ratio = np.median((first.learned.rho * depth)[learned]) / np.median((first.rho * depth)[known])
     assert abs(np.log(ratio)) < 0.05

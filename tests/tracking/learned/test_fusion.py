@@ -38,18 +38,18 @@ def keyframe(pointmap: Pointmap) -> Keyframe:
 def test_what_was_not_triangulated_is_completed_by_the_learned_depth() -> None:
     pointmap = filled()
     np.testing.assert_array_equal(pointmap.rho, measured().rho)
-    whole = pointmap.completed(KNOWN_SIGMA)
+    whole = pointmap.complete(KNOWN_SIGMA)
     np.testing.assert_array_equal(whole.rho[:, :HALF], 1.0 / TRUTH[:, :HALF])
     error = np.abs(np.log(whole.rho * TRUTH))[:, HALF:]
     assert np.median(error) < 0.08
-    assert whole.known(KNOWN_SIGMA).mean() > 0.9
-    assert not pointmap.known(KNOWN_SIGMA)[:, HALF:].any()
+    assert whole.is_known(KNOWN_SIGMA).mean() > 0.9
+    assert not pointmap.is_known(KNOWN_SIGMA)[:, HALF:].any()
 
 
 def test_a_triangulation_that_is_not_good_enough_is_completed_and_not_lost() -> None:
     pointmap = filled(share=0.5)
     pointmap.variance[:, :HALF] = (0.3 * pointmap.rho[:, :HALF]) ** 2
-    whole = pointmap.completed(KNOWN_SIGMA)
+    whole = pointmap.complete(KNOWN_SIGMA)
     assert pointmap.learned is not None
     np.testing.assert_array_equal(whole.rho, pointmap.learned.rho)
     np.testing.assert_array_equal(pointmap.rho[:, :HALF], 1.0 / TRUTH[:, :HALF])
@@ -61,7 +61,7 @@ def test_nothing_changes_without_ranges_or_where_they_are_not_wanted(config: Lea
     given = (None, None) if config.depth else (X, Q)
     assert add_learned(pointmap, *given, KNOWN_SIGMA, config) is None
     assert pointmap.learned is None
-    assert pointmap.completed(KNOWN_SIGMA) is pointmap
+    assert pointmap.complete(KNOWN_SIGMA) is pointmap
 
 
 def test_triangulation_does_not_see_what_was_learned() -> None:
@@ -101,7 +101,7 @@ def test_where_the_camera_only_turned_the_unit_is_that_of_what_was_learned_befor
     before, X, Q = filled(), *network(unit=5.0)
     now = Pointmap.unknown(CAMERA)
     assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig()) is None
-    seen = before.completed(KNOWN_SIGMA)
+    seen = before.complete(KNOWN_SIGMA)
     assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig(), before=lambda: seen) is not None
     assert now.learned is not None
     assert np.median(np.abs(np.log(now.learned.rho * TRUTH))) < 0.08

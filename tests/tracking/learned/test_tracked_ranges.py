@@ -56,9 +56,9 @@ def whole() -> Run:
 def test_half_a_picture_without_matches_has_learned_depths(whole: Run) -> None:
     pointmap = whole.store[0].pointmap
     right = np.s_[:, SMALL.width // 2 + 4 :]
-    assert not pointmap.known(0.15)[right].any()
-    pointmap = pointmap.completed(0.15)
-    assert pointmap.known(0.15)[right].mean() > 0.9
+    assert not pointmap.is_known(0.15)[right].any()
+    pointmap = pointmap.complete(0.15)
+    assert pointmap.is_known(0.15)[right].mean() > 0.9
     truth = plane_depth(POSES[whole.store[0].frame_index])
     ratio = (1.0 / pointmap.rho / truth)[pointmap.rho > 0.0]
     assert np.median(np.abs(np.log(ratio / np.median(ratio)))) < 0.06
@@ -72,5 +72,5 @@ def test_noise_in_place_of_an_output_changes_poses_or_depths(whole: Run, spoilt:
         for found in (whole, other)
     ]
     same_poses = poses[0].shape == poses[1].shape and np.array_equal(*poses)
-    depths = [found.store[0].pointmap.completed(0.15).rho for found in (whole, other)]
+    depths = [found.store[0].pointmap.complete(0.15).rho for found in (whole, other)]
     assert not (same_poses and np.array_equal(*depths))

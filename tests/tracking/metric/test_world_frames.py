@@ -40,7 +40,7 @@ def test_a_failing_estimate_leaves_the_graph_its_own_optimisation(
     def fails(*_: object) -> None:
         raise ArithmeticError("not finite")
 
-    monkeypatch.setattr(world_frames, "straightened", fails)
+    monkeypatch.setattr(world_frames, "straighten", fails)
     failures = Failures(strict=False)
     metric, graph = of_a_dive(failures), looped()
     metric.add(Depth(0, 0, "bar30", 3.0))
@@ -49,7 +49,7 @@ def test_a_failing_estimate_leaves_the_graph_its_own_optimisation(
     assert 1.83 < result.poses[2].t[0] < 1.86  # between the links and what goes across
     (kind,) = failures.to_json()
     assert kind["stage"] == "telemetry in the keyframe graph"
-    metric.applied()
+    metric.apply()
     assert metric.frames == {}
 
 

@@ -58,7 +58,7 @@ def test_a_display_is_masked_within_a_few_pictures_with_its_changing_digits(disp
     finder, covered = OverlayFinder(), []
     for k in range(20):
         image, drawn = shown(k, display)
-        masked = finder.masked(frame(k, image))
+        masked = finder.mask(frame(k, image))
         if k >= FOUND_WITHIN:
             assert masked.mask is not None
             covered.append(float((~masked.mask)[drawn].mean()))
@@ -68,17 +68,17 @@ def test_a_display_is_masked_within_a_few_pictures_with_its_changing_digits(disp
 
 def test_a_scene_without_a_display_is_not_masked() -> None:
     finder = OverlayFinder()
-    assert all(finder.masked(frame(k, view(k))).mask is None for k in range(40))
+    assert all(finder.mask(frame(k, view(k))).mask is None for k in range(40))
     assert finder.share == 0.0
 
 
 def test_a_vehicle_that_stands_still_keeps_its_scene() -> None:
     finder = OverlayFinder()
     for k in range(8):
-        finder.masked(frame(k, view(k)))
+        finder.mask(frame(k, view(k)))
     for k in range(8, 80):  # the same view, with the noise of another picture
         still = np.clip(FLOOR[:, 136 : 136 + WIDTH] + (k % 3), 0, 255).astype(np.uint8)
-        assert finder.masked(frame(k, still)).mask is None
+        assert finder.mask(frame(k, still)).mask is None
 
 
 def test_fish_before_a_vehicle_that_stands_still_do_not_make_its_scene_an_overlay() -> None:
@@ -88,7 +88,7 @@ def test_fish_before_a_vehicle_that_stands_still_do_not_make_its_scene_an_overla
         for fish in range(5):
             x = (40 * k + 90 * fish) % (WIDTH - 70)
             image[60 * fish : 60 * fish + 40, x : x + 70] = view(30 + k % 7)[:40, :70]
-        assert finder.masked(frame(k, image)).mask is None
+        assert finder.mask(frame(k, image)).mask is None
 
 
 def test_a_display_is_found_where_the_vehicle_first_stood_still() -> None:
@@ -96,9 +96,9 @@ def test_a_display_is_found_where_the_vehicle_first_stood_still() -> None:
     for k in range(30):
         image = view(0)
         burn_in(image, "clock", float(k))
-        assert finder.masked(frame(k, image)).mask is None
+        assert finder.mask(frame(k, image)).mask is None
     for k in range(1, 12):
-        masked = finder.masked(frame(30 + k, shown(k, "clock")[0]))
+        masked = finder.mask(frame(30 + k, shown(k, "clock")[0]))
     assert masked.mask is not None
 
 
@@ -108,7 +108,7 @@ def test_a_part_of_the_vehicle_that_is_always_in_view_is_masked() -> None:
     for k in range(16):
         image = view(k)
         image[HEIGHT - 80 :, 190:290] = arm[HEIGHT - 80 :, 190:290]
-        masked = finder.masked(frame(k, image))
+        masked = finder.mask(frame(k, image))
     assert masked.mask is not None
     assert (~masked.mask[HEIGHT - 80 :, 190:290]).mean() > 0.8
     assert masked.mask[:200].mean() > 0.99
@@ -117,10 +117,10 @@ def test_a_part_of_the_vehicle_that_is_always_in_view_is_masked() -> None:
 def test_a_display_that_is_switched_off_is_given_back() -> None:
     finder = OverlayFinder()
     for k in range(12):
-        masked = finder.masked(frame(k, shown(k, "clock")[0]))
+        masked = finder.mask(frame(k, shown(k, "clock")[0]))
     assert masked.mask is not None
     for k in range(12, 60):
-        masked = finder.masked(frame(k, view(k)))
+        masked = finder.mask(frame(k, view(k)))
     assert masked.mask is None or masked.mask.mean() > 0.995
 
 
@@ -129,7 +129,7 @@ def test_a_source_s_own_mask_is_kept() -> None:
     own = np.ones((HEIGHT, WIDTH), bool)
     own[:, :50] = False
     for k in range(12):
-        masked = finder.masked(frame(k, shown(k, "clock")[0], own))
+        masked = finder.mask(frame(k, shown(k, "clock")[0], own))
     assert masked.mask is not None
     assert not masked.mask[:, :50].any()
     assert not masked.mask[18:25, 60:150].any()
@@ -139,6 +139,6 @@ def test_small_pictures_are_looked_at_too() -> None:
     finder = OverlayFinder()
     for k in range(14):
         image = cv2.resize(shown(k, "clock")[0], (240, 180), interpolation=cv2.INTER_AREA)
-        masked = finder.masked(frame(k, np.asarray(image)))
+        masked = finder.mask(frame(k, np.asarray(image)))
     assert masked.mask is not None
     assert 0.02 < 1.0 - masked.mask.mean() < 0.16

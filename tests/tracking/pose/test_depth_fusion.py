@@ -230,7 +230,7 @@ def test_many_noisy_measurements_become_one_good_depth() -> None:
         pair = two_views()
         pair.matches = pair.matches + rng.normal(0, 0.3, pair.matches.shape).astype(np.float32)
         fuse(pointmap, pair, T_BA, SMALL, SIGMA_PX)
-    known = pointmap.known(0.1)
+    known = pointmap.is_known(0.1)
     error = np.abs(pointmap.rho * DEPTH - 1.0)[known]
     assert known.mean() > 0.5
     assert np.median(error) < 0.03
@@ -276,7 +276,7 @@ def test_pixels_that_are_unreliable_or_unknown_stay_unknown() -> None:
     reliable = np.ones(DEPTH.shape, bool)
     reliable[20:30] = False
     moved = transfer(pointmap, grid, reliable, Sim3.identity(), SMALL)
-    assert not moved.known(10.0)[:30].any()
+    assert not moved.is_known(10.0)[:30].any()
     np.testing.assert_allclose(moved.rho[30:], pointmap.rho[30:])
 
 
@@ -301,7 +301,7 @@ def test_sources_outside_the_picture_take_the_border() -> None:
 
 def test_an_unknown_pointmap_knows_nothing() -> None:
     pointmap = Pointmap.unknown(SMALL)
-    assert not pointmap.known(1.0).any()
+    assert not pointmap.is_known(1.0).any()
     assert not pointmap.Q.any()
     assert np.isnan(pointmap.points()).all()
 
@@ -309,8 +309,8 @@ def test_an_unknown_pointmap_knows_nothing() -> None:
 def test_the_point_confidence_is_one_over_the_relative_variance() -> None:
     pointmap = Pointmap(SMALL, np.full(DEPTH.shape, 0.5), np.full(DEPTH.shape, 0.01))
     np.testing.assert_allclose(pointmap.Q, 25.0)
-    assert pointmap.known(0.21).all()
-    assert not pointmap.known(0.19).any()
+    assert pointmap.is_known(0.21).all()
+    assert not pointmap.is_known(0.19).any()
     pointmap.variance[:] = 0.0
     assert np.isfinite(pointmap.Q).all()
 

@@ -44,7 +44,7 @@ def test_compiled_equations_are_those_of_the_rows(at: Sim3, around: bool) -> Non
     for found, expected in zip(compiled.at(at), readable.at(at), strict=True):
         scale = np.abs(expected).max()
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * scale)
-    for found, expected in zip(compiled.left(at), readable.left(at), strict=True):
+    for found, expected in zip(compiled.linearise_at(at), readable.linearise_at(at), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 

@@ -123,7 +123,7 @@ def test_the_pixel_scores_are_the_gradient_of_the_cost_in_spite_of_noisy_depths(
 
 
 def test_the_papers_residual_shrinks_scale_at_every_link_and_pixels_do_not() -> None:
-    """docs/measurements.md#pose-solver, at 5 % depth noise."""
+    """notes/measurements.md#pose-solver, at 5 % depth noise."""
     point = drift("point", 0.05, free_scale=True)[0]
     assert point < -0.005
     for residual in ("ray", "pixel"):

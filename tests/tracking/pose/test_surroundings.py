@@ -65,7 +65,7 @@ def test_noise_does_not_select_its_points() -> None:
     """Depths as uncertain as the limit: by their own value, the nearer ones are taken."""
     pointmap = noisy(0, np.full((180, 240), 2.0), 0.15, 0.15)
     _, known = surroundings(pointmap, 0.15)
-    own = pointmap.known(0.15)
+    own = pointmap.is_known(0.15)
     assert abs(2.0 * pointmap.rho[known].mean() - 1.0) < 0.01
     assert 2.0 * pointmap.rho[own].mean() > 1.1
 

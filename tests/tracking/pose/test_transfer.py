@@ -33,8 +33,8 @@ def test_a_depth_between_two_surfaces_is_known_no_better_than_they_differ() -> N
     moved = transfer(step, grid + np.float32([0.5, 0.0]), everywhere, Sim3.identity(), SMALL)
     sigma = np.sqrt(moved.variance[:, 29])
     np.testing.assert_allclose(sigma, 0.25, rtol=1e-3)
-    assert not moved.known(0.15)[:, 29].any()
-    assert moved.known(0.15)[:, :28].all()
+    assert not moved.is_known(0.15)[:, 29].any()
+    assert moved.is_known(0.15)[:, :28].all()
 
 
 def test_a_depth_needs_a_known_pixel_near() -> None:
@@ -51,4 +51,4 @@ def test_a_depth_needs_a_known_pixel_near() -> None:
             Sim3.identity(),
             SMALL,
         )
-        assert moved.known(0.15).sum() == known
+        assert moved.is_known(0.15).sum() == known

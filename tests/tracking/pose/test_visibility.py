@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.pose.visibility import agreeing, expected, predicted_matches, visibility
+from aquaflow.tracking.pose.visibility import agreeing, is_expected, predicted_matches, visibility
 from tests.tracking.tracking_scenes import CAMERA, pose
 
 DEPTH = 2.0
@@ -71,7 +71,7 @@ def test_of_a_keyframe_that_is_not_there_nothing_is_hidden() -> None:
 @pytest.mark.filterwarnings("error")
 def test_points_in_the_camera_centre_or_that_are_no_numbers_are_not_expected() -> None:
     points = np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 1.0], [0.0, 0.0, 1.0]])
-    assert expected(points, Sim3.identity(), CAMERA).tolist() == [False, False, True]
+    assert is_expected(points, Sim3.identity(), CAMERA).tolist() == [False, False, True]
 
 
 def test_matches_are_predicted_where_depth_is_known_and_only_there() -> None:

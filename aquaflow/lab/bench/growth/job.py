@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 
 from aquaflow.config import Config
-from aquaflow.config.presets import configured
+from aquaflow.config.presets import load_configured
 
 THREADS = 1
 """CPU time is the work done then, whatever else the machine does; and what is spent outside of the
@@ -31,7 +31,7 @@ class GrowthJob:
             ConfigError: there is no such preset.
         """
         asked = {"threads": THREADS, "mapping": {"enabled": not self.tracking_only}}
-        return configured(None, self.preset, asked, "benchmark of growth")
+        return load_configured(None, self.preset, asked, "benchmark of growth")
 
     def to_text(self) -> str:
         """As JSON, for the process."""

@@ -24,7 +24,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.views import open_finished
-from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed
+from aquaflow.geometry.arrays import Arrays, add_prefix, of_sim3
 from aquaflow.lab.bench.answer import answer
 from aquaflow.lab.bench.growth.job import THREADS, GrowthJob
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
@@ -47,7 +47,7 @@ def perform(job: GrowthJob) -> dict[str, Any]:
         slam = Slam(config, Stages(Profiler(clock=time.thread_time)), folder.work)
         try:
             run = DiveRun("survey", folder, config, slam, survey.camera, survey.name_of)
-            row = _dived(run, survey, job.frames) | _finished(run)
+            row = _measure_dive(run, survey, job.frames) | _finish_run(run)
             folder.set_finished()
         finally:
             slam.close()
@@ -60,7 +60,7 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     return row
 
 
-def _dived(run: DiveRun, survey: SurveyPictures, frames: int) -> dict[str, Any]:
+def _measure_dive(run: DiveRun, survey: SurveyPictures, frames: int) -> dict[str, Any]:
     """What there is when the last frame is in."""
     meter = TenthsMeter(run, frames)
     for frame in survey.frames(frames):
@@ -77,7 +77,7 @@ def _dived(run: DiveRun, survey: SurveyPictures, frames: int) -> dict[str, Any]:
     }
 
 
-def _finished(run: DiveRun) -> dict[str, Any]:
+def _finish_run(run: DiveRun) -> dict[str, Any]:
     """The end of the dive: the last adjustment, refining, evaluation and files."""
     began_s = time.process_time()
     metrics = run.finish([]).metrics
@@ -143,7 +143,7 @@ def checkpoint_bytes(slam: Slam, scratch: Path) -> int:
     facts, arrays = {}, _of_tracking(slam)
     for number, mapper in slam.mappers.items():
         facts[str(number)], parts = state.serialise(mapper, optimiser=True)
-        arrays |= prefixed(f"map{number}", parts)
+        arrays |= add_prefix(f"map{number}", parts)
     try:
         write_facts_file(scratch, facts, arrays)
         return scratch.stat().st_size
@@ -157,7 +157,7 @@ def _of_tracking(slam: Slam) -> Arrays:
         "frames": slam.frames.rows(),
         "keyframes": np.array([(k.frame_index, k.t_ns, k.sub_map, 0, 0) for k in keyframes]),
         "poses": of_sim3([keyframe.T_wc for keyframe in keyframes]),
-        **prefixed("graph", dict(slam.graph.graph.tables())),
+        **add_prefix("graph", dict(slam.graph.graph.tables())),
     }
 
 

@@ -24,7 +24,7 @@ from aquaflow.lab.bench.render.parts import TimedPart, parts_of, time_parts
 from aquaflow.lab.bench.render.peak import PeakRate, measure_peak
 from aquaflow.lab.bench.render.picture import draw
 from aquaflow.lab.bench.render.rows import Row, row_of
-from aquaflow.lab.bench.render.timing import Sample, interleaved
+from aquaflow.lab.bench.render.timing import Sample, interleave
 from aquaflow.render.contract import CPU, Renderer
 from aquaflow.render.example_scene import NAMES, SMALL, Size, SplatScene, height_field
 from aquaflow.render.parity import differences
@@ -138,7 +138,7 @@ def _samples(
     """Interleaved; a contender that fails once has none."""
     jobs = [partial(_attempt, contender, scene, notes) for contender in contenders]
     found = []
-    for contender, attempts in zip(contenders, interleaved(jobs, repeats), strict=True):
+    for contender, attempts in zip(contenders, interleave(jobs, repeats), strict=True):
         samples = [sample for sample in attempts if sample is not None]
         if len(samples) == len(attempts):
             found.append((contender, samples))

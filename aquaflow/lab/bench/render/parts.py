@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.lab.bench.meter import meter_of
-from aquaflow.lab.bench.render.timing import Clock, interleaved, spread_of, torch_threads
+from aquaflow.lab.bench.render.timing import Clock, interleave, spread_of, torch_threads
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU
 from aquaflow.render.photometric import photometric_loss
@@ -43,7 +43,7 @@ class TimedPart:
     """False: the work has its own threads, and torch's would only spin in addition."""
     device: torch.device = CPU
 
-    def timed(self, clock: Clock) -> tuple[float, float]:
+    def measure_time(self, clock: Clock) -> tuple[float, float]:
         """Milliseconds on the wall, and of this thread's CPU time."""
         meter = meter_of(self.device)
         with torch_threads(self.threads if self.uses_torch_threads else 1):
@@ -119,15 +119,15 @@ def time_parts(
 
     def job(part: TimedPart) -> Callable[[], tuple[float, float]]:
         def timed() -> tuple[float, float]:
-            sample = part.timed(clock)
+            sample = part.measure_time(clock)
             tick()
             return sample
 
         return timed
 
     for part in parts:
-        part.timed(clock)
-    results = interleaved([job(part) for part in parts], repeats)
+        part.measure_time(clock)
+    results = interleave([job(part) for part in parts], repeats)
     return [_row(part, samples) for part, samples in zip(parts, results, strict=True)]
 
 

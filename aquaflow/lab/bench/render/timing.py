@@ -96,7 +96,7 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def interleaved(jobs: Sequence[Callable[[], T]], repeats: int) -> list[list[T]]:
+def interleave(jobs: Sequence[Callable[[], T]], repeats: int) -> list[list[T]]:
     """Results of each job, in the order of ``jobs``.
 
     Repeats are the outer loop and each starts with another job, so that a machine that slows down

@@ -58,7 +58,7 @@ def restore(
         raise NotRestoredError("the ranges of the held-out views are missing or damaged")
     every = -(-len(pictures) // FIT_VIEWS)
     water = _fit(pictures[::every], ranges[::every])
-    restored = np.stack([_restored(*view, water) for view in zip(pictures, ranges, strict=True)])
+    restored = np.stack([_restore(*view, water) for view in zip(pictures, ranges, strict=True)])
     # In each channel the brightest of all views is white; some light is left, or there was no fit.
     return np.asarray(restored / restored.max(axis=(0, 1, 2)), np.float32)
 
@@ -67,7 +67,7 @@ def _fit(
     pictures: Pictures,  # [N, H, W, 3]
     ranges: Ranges,  # [N, H, W]
 ) -> _Water:
-    known = _known(ranges)
+    known = _known_ranges(ranges)
     if known.sum() < FEWEST_PIXELS:
         raise NotRestoredError(f"fewer than {FEWEST_PIXELS} pixels have a range")
     near, median, far = map(float, np.percentile(ranges[known], RANGE_PERCENTILES))
@@ -82,13 +82,13 @@ def _fit(
     return _Water(near, far, median, veil, fit_attenuation(light, at))
 
 
-def _restored(
+def _restore(
     picture: Pictures,  # [H, W, 3]
     ranges: Ranges,  # [H, W]
     water: _Water,
 ) -> Pictures:
     """[H, W, 3] J, 0 where the range is unknown; its unit is the light of the fit."""
-    known = _known(ranges)
+    known = _known_ranges(ranges)
     z = np.clip(ranges[known].astype(np.float64), water.near, water.far) / water.median
     direct = np.maximum(picture[known] - backscatter(water.veil, z), 0.0)
     depth = np.stack([two_exponentials(rate, z) * z for rate in water.rates], axis=-1)
@@ -97,7 +97,7 @@ def _restored(
     return restored
 
 
-def _known(
+def _known_ranges(
     ranges: Ranges,  # [...]
 ) -> npt.NDArray[np.bool_]:
     return np.asarray(np.isfinite(ranges) & (ranges > 0.0))

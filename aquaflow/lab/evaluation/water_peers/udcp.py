@@ -36,10 +36,10 @@ def restore(
     Raises:
         NotRestoredError: a picture is too dark to show the water's colour.
     """
-    return np.stack([_restored(picture) for picture in pictures])
+    return np.stack([_restore(picture) for picture in pictures])
 
 
-def _restored(
+def _restore(
     picture: Plane,  # [H, W, 3] in [0, 1]
 ) -> Plane:
     water = _open_water(picture)
@@ -49,7 +49,7 @@ def _restored(
     relative = np.maximum(water, np.float32(DARKEST_WATER))
     coarse = 1.0 - _dark_channel(np.asarray(picture / relative, np.float32))
     guide = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32)
-    transmission = np.maximum(_guided(coarse, guide), LEAST_TRANSMISSION)
+    transmission = np.maximum(_guided_filter(coarse, guide), LEAST_TRANSMISSION)
     restored = (picture - water) / transmission[..., None] + water
     return np.clip(restored, 0.0, 1.0).astype(np.float32)
 
@@ -71,7 +71,7 @@ def _open_water(
     return np.asarray(picture.reshape(-1, 3)[chosen].mean(axis=0), np.float32)
 
 
-def _guided(
+def _guided_filter(
     values: Plane,  # [H, W]
     guide: Plane,  # [H, W] in [0, 1]
 ) -> Plane:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
-from aquaflow.lab.synthetic.telemetry.series import chosen
+from aquaflow.lab.synthetic.telemetry.series import choose
 from aquaflow.lab.synthetic.telemetry.sonar import Sonar
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 
@@ -31,7 +31,7 @@ def altitude(
     beam, longest = np.radians(noise.altitude_beam_deg), noise.altitude_longest_m
     true = sonar.first_return(origin_s, R_sb, beam, longest)
     white = noise.altitude_sigma_m * rng.standard_normal(len(t))
-    multipath = chosen(len(t), noise.altitude_multipath_share, rng)
+    multipath = choose(len(t), noise.altitude_multipath_share, rng)
     measured = np.where(multipath, 2.0, 1.0) * true + white
     if noise.altitude_resolution_m > 0.0:
         measured = noise.altitude_resolution_m * np.round(measured / noise.altitude_resolution_m)

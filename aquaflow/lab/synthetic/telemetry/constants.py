@@ -52,13 +52,13 @@ def draw_constants(config: SyntheticConfig) -> Constants:
         tide_phase_rad=tide,
         wave_phase_rad=wave,
         heading_offset_deg=noise.heading_offset_sigma_deg * heading,
-        rate_bias_rad_s=_scaled(rate, noise.rate_bias_sigma_rad_s),
-        acceleration_bias_m_s2=_scaled(acceleration, noise.acceleration_bias_sigma_m_s2),
+        rate_bias_rad_s=_scale(rate, noise.rate_bias_sigma_rad_s),
+        acceleration_bias_m_s2=_scale(acceleration, noise.acceleration_bias_sigma_m_s2),
         dvl_scale=noise.dvl_scale_sigma * dvl,
     )
 
 
-def _scaled(
+def _scale(
     draws: np.ndarray[Any, np.dtype[np.float64]],  # [3]
     sigma: float,
 ) -> Vector:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
-from aquaflow.lab.synthetic.telemetry.series import chosen
+from aquaflow.lab.synthetic.telemetry.series import choose
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 
 __all__ = ["position", "utc_time"]
@@ -31,7 +31,7 @@ def position(
     heard_from = t - noise.position_lag_s
     error = noise.position_sigma_m * rng.standard_normal((len(t), 2))
     stray = noise.position_outlier_sigma_m * rng.standard_normal((len(t), 2))
-    outlier = chosen(len(t), noise.position_outlier_share, rng)
+    outlier = choose(len(t), noise.position_outlier_share, rng)
     place = motion.origin_w(heard_from)[:, :2] + np.where(outlier[:, None], stray, error)
     sigma = np.full((len(t), 1), noise.position_sigma_m)
     found = np.hstack([_on_earth(place, noise), sigma])

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-__all__ = ["chosen", "random_walk", "stretches", "wander"]
+__all__ = ["choose", "random_walk", "stretches", "wander"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Mask: TypeAlias = npt.NDArray[np.bool_]
@@ -43,7 +43,7 @@ def random_walk(
     return np.asarray(np.cumsum(steps, axis=0))
 
 
-def chosen(count: int, share: float, rng: np.random.Generator) -> Mask:
+def choose(count: int, share: float, rng: np.random.Generator) -> Mask:
     """[count] True for single samples, a ``share`` of them on average."""
     return np.asarray(rng.uniform(size=count) < share)
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.constants import Constants
-from aquaflow.lab.synthetic.telemetry.series import chosen, stretches
+from aquaflow.lab.synthetic.telemetry.series import choose, stretches
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 
 __all__ = ["velocity"]
@@ -33,6 +33,6 @@ def velocity(
     true_d = (1.0 + constants.dvl_scale) * motion.velocity_b(t) @ motion.mountings.R_bd
     measured = true_d + sigma * rng.standard_normal((len(t), 3))
     merit = sigma * np.exp(noise.dvl_merit_spread * rng.standard_normal((len(t), 1)))
-    silent = chosen(len(t), noise.dvl_dropout_share, rng)
+    silent = choose(len(t), noise.dvl_dropout_share, rng)
     silent |= stretches(t, noise.dvl_lock_losses_per_min, noise.dvl_lock_loss_s, rng)
     return np.where(silent[:, None], np.nan, np.hstack([measured, merit]))

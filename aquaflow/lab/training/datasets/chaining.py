@@ -24,7 +24,7 @@ MIN_LENGTH = 2
 """Pictures of a stretch that pairs can be found in."""
 
 
-def chained(frames: Frames) -> list[Frames]:
+def chain(frames: Frames) -> list[Frames]:
     """Stretches in which every picture's pose follows from the one before.
 
     Where two neighbours do not prove their relative pose, one stretch ends and another begins.
@@ -42,7 +42,7 @@ def chained(frames: Frames) -> list[Frames]:
             readers, T_wc = [], np.eye(4)
         else:
             T_wc = T_wc @ np.linalg.inv(T_ba)
-        readers.append(partial(_posed, reader, T_wc))
+        readers.append(partial(_pose, reader, T_wc))
         before = now
     return stretches + _stretch(frames.name, len(frames), readers)
 
@@ -84,7 +84,7 @@ def _matches(a: tuple[Posed, Keypoints], b: tuple[Posed, Keypoints]) -> tuple[Ar
     return (rays * z[:, None])[known], there[known]
 
 
-def _posed(
+def _pose(
     reader: Callable[[], Posed],
     T_wc: Array,  # [4, 4] m
 ) -> Posed:

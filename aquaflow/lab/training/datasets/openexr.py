@@ -96,14 +96,14 @@ def _pixels(data: bytes, header: _Header, at: int) -> npt.NDArray[np.float32]:
         count = min(lines, header.height - row)
         block = data[offset + 8 : offset + 8 + size]
         if header.compression and size < count * line_bytes:
-            block = _inflated(block)
+            block = _inflate(block)
         rows = np.frombuffer(block, np.uint8).reshape(count, line_bytes)
         values = np.ascontiguousarray(rows[:, : first.itemsize * header.width]).view(first)
         image[row : row + count] = values
     return image
 
 
-def _inflated(block: bytes) -> bytes:
+def _inflate(block: bytes) -> bytes:
     """Unzip, undo the differences, and put the two interleaved halves together."""
     raw = np.frombuffer(zlib.decompress(block), np.uint8).astype(np.int64)
     raw[1:] -= 128

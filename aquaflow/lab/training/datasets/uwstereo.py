@@ -62,13 +62,13 @@ def _pair(disparity: Path, rig: StereoRig, root: Path) -> Frames:
     folder = disparity.parents[1]
     name = f"{disparity.stem}.png"
     readers = (
-        partial(_left, folder / "images" / "left" / name, disparity, rig),
+        partial(_left_picture, folder / "images" / "left" / name, disparity, rig),
         partial(_right, folder / "images" / "right" / name, disparity, rig),
     )
     return Frames(str(disparity.relative_to(root)), readers)
 
 
-def _left(image: Path, disparity: Path, rig: StereoRig) -> Posed:
+def _left_picture(image: Path, disparity: Path, rig: StereoRig) -> Posed:
     depth = depth_of(read_pfm(disparity), rig)
     return Posed(read_image(image), depth, pinhole(rig.fx, rig.fy, rig.cx, rig.cy), np.eye(4))
 

@@ -2,5 +2,5 @@
 
 Geometry costs most and is kept in a pool on disk; water, light, the camera's behaviour and the
 window that is looked at are drawn anew each time a pair is used
-(docs/measurements.md#compact-prior).
+(notes/measurements.md#compact-prior).
 """

@@ -44,11 +44,11 @@ def with_bodies(draw: Draw, pair: Pair) -> Pair:
     for view, swims, sways in zip((pair.a, pair.b), fish, arm, strict=True):
         place = torch.where(has_arm[..., None], sways[0], swims[0])
         inside = torch.where(has_arm, sways[1], swims[1])
-        views.append(_covered(view, place, inside, skin, depth))
+        views.append(_cover(view, place, inside, skin, depth))
     return Pair(*views)
 
 
-def _covered(
+def _cover(
     view: ViewBatch,
     place: Tensor,  # [B, H, W, 2] in the body's frame, in [-1, 1] on it
     inside: Tensor,  # [B, H, W] bool
@@ -82,7 +82,7 @@ def _fish(draw: Draw, view: ViewBatch) -> Shapes:
         inside = torch.zeros(batch, height, width, dtype=torch.bool, device=draw.device)
         for number in range(FISH):
             own = (
-                _turned(view, centre[:, number], heading[:, number])
+                _turn(view, centre[:, number], heading[:, number])
                 / long[:, number, None, None, None]
             )
             x, y = own[..., 0], own[..., 1] / slim[:, number, None, None]
@@ -108,7 +108,7 @@ def _arm(draw: Draw, view: ViewBatch) -> Shapes:
     for _ in "ab":
         along = hand - shoulder
         length = along.norm(dim=-1).clamp_min(1.0)
-        own = _turned(view, shoulder, torch.atan2(along[:, 1], along[:, 0]))
+        own = _turn(view, shoulder, torch.atan2(along[:, 1], along[:, 0]))
         x = own[..., 0] / length[:, None, None]
         y = own[..., 1] / half[:, None, None]
         beyond = (own[..., 0] - length[:, None, None]).clamp_min(0.0) / half[:, None, None]
@@ -118,7 +118,7 @@ def _arm(draw: Draw, view: ViewBatch) -> Shapes:
     return shapes
 
 
-def _turned(
+def _turn(
     view: ViewBatch,
     centre: Tensor,  # [B, 2] px
     angle: Tensor,  # [B] radians, of the x axis

@@ -32,7 +32,7 @@ class PairMotion:
 TRAINING = PairMotion(baseline=0.8, forward=0.25)
 """Of the pairs that are learned from: wider than what is held out, and a quarter along the axis."""
 WIDE = PairMotion(baseline=0.45, power=1.5, tilt=0.07, roll=0.12)
-"""Of the held-out pairs: the motion of the prototypes' measurements (docs/measurements.md)."""
+"""Of the held-out pairs: the motion of the prototypes' measurements (notes/measurements.md)."""
 WIDER = PairMotion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
 """Of a second held-out set: every baseline as likely as another, and more roll."""
 

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from aquaflow.lab.training.pair_generator.bodies import with_bodies
 from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.noise import periodic, spectral, wrapped
+from aquaflow.lab.training.pair_generator.noise import periodic, spectral, wrap
 from aquaflow.lab.training.pair_generator.overlays import with_overlay
 from aquaflow.lab.training.pair_generator.render import median_depth
 from aquaflow.lab.training.pairs import Pair, ViewBatch
@@ -32,7 +32,7 @@ class Conditions:
     low_light: float = 0.1
     overlay: float = 0.1
 
-    def scaled(self, factor: float) -> Conditions:
+    def scale(self, factor: float) -> Conditions:
         """All shares times ``factor``: a training begins with what is easy."""
         return Conditions(*(factor * getattr(self, field.name) for field in fields(self)))
 
@@ -70,7 +70,7 @@ def _some(
     effect: Callable[[Draw, Tensor], Tensor],
 ) -> Tensor:
     """[B, 3, H, W], ``effect`` on ``share`` of them."""
-    chosen = _chosen(draw, share, len(images))
+    chosen = _choose(draw, share, len(images))
     if len(chosen) == 0:
         return images
     return images.index_put((chosen,), effect(draw, images[chosen]))
@@ -78,14 +78,14 @@ def _some(
 
 def _some_pairs(draw: Draw, share: float, pair: Pair, effect: Callable[[Draw, Pair], Pair]) -> Pair:
     """The pairs, ``effect`` on ``share`` of them."""
-    chosen = _chosen(draw, share, len(pair.a.K))
+    chosen = _choose(draw, share, len(pair.a.K))
     if len(chosen) == 0:
         return pair
     changed = effect(draw, Pair(_rows(pair.a, chosen), _rows(pair.b, chosen)))
-    return Pair(_replaced(pair.a, chosen, changed.a), _replaced(pair.b, chosen, changed.b))
+    return Pair(_replace(pair.a, chosen, changed.a), _replace(pair.b, chosen, changed.b))
 
 
-def _chosen(draw: Draw, share: float, batch: int) -> Tensor:
+def _choose(draw: Draw, share: float, batch: int) -> Tensor:
     """[N] int64; a share of zero draws nothing, so that calm pairs are what they always were."""
     if share == 0.0:
         return torch.zeros(0, dtype=torch.long, device=draw.device)
@@ -99,7 +99,7 @@ def _rows(
     return ViewBatch(*(getattr(view, field.name)[chosen] for field in fields(view)))
 
 
-def _replaced(
+def _replace(
     view: ViewBatch,
     chosen: Tensor,  # [N] int64
     new: ViewBatch,
@@ -222,7 +222,7 @@ def with_caustics(draw: Draw, pair: Pair) -> Pair:
     waves = spectral(draw, TEXELS, draw.uniform(batch, low=SLOPE[0], high=SLOPE[1]))
     light = torch.exp(-draw.uniform(batch, 1, 1, low=2.0, high=6.0) * waves.abs())
     light = (light / light.mean(dim=(1, 2), keepdim=True)).clamp_max(BRIGHTEST)
-    pattern = wrapped(light[:, None])
+    pattern = wrap(light[:, None])
     views = []
     for view in (pair.a, pair.b):
         moved = draw.uniform(batch, 1, 2)

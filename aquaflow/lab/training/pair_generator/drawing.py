@@ -14,7 +14,7 @@ from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.render import median_depth
 from aquaflow.lab.training.pair_generator.scene import rotation
 from aquaflow.lab.training.pair_generator.second_view import turned_view
-from aquaflow.lab.training.pair_generator.sensor import taken
+from aquaflow.lab.training.pair_generator.sensor import take_picture
 from aquaflow.lab.training.pair_generator.water import random_water, turbidity
 from aquaflow.lab.training.pairs import Pair, ViewBatch, seen_from
 
@@ -49,11 +49,11 @@ def through_water(draw: Draw, pair: Pair, conditions: Conditions = CALM) -> Pair
     water = random_water(draw, median_depth(pair.a))
     water = water.denser(turbidity(draw, conditions.turbid, len(pair.a.K)))
     a, b = (
-        replace(view, image=taken(draw, conditions.before_lens(draw, water.through(view))))
+        replace(view, image=take_picture(draw, conditions.before_lens(draw, water.through(view))))
         for view in (pair.a, pair.b)
     )
     pair = conditions.after_sensor(draw, Pair(a, b))
-    return Pair(_uncovered(pair.a, bare.a), _uncovered(pair.b, bare.b))
+    return Pair(_uncover(pair.a, bare.a), _uncover(pair.b, bare.b))
 
 
 def training_pair(
@@ -61,9 +61,9 @@ def training_pair(
 ) -> Pair:
     """One use of pairs without water: other windows, another water, another camera."""
     if bool(draw.chance(0.5)):
-        clear = clear.swapped()
+        clear = clear.swap()
     same = draw.chance(looks.same_place, len(clear.a.K))
-    clear = Pair(clear.a, _chosen(same, clear.a, clear.b))
+    clear = Pair(clear.a, _choose(same, clear.a, clear.b))
     pair = through_water(draw, windows(draw, clear, looks), conditions)
     if bool(draw.chance(looks.recoloured)):
         order = torch.randperm(3, generator=draw.generator, device=draw.device)
@@ -72,7 +72,7 @@ def training_pair(
     return pair
 
 
-def _uncovered(view: ViewBatch, bare: ViewBatch) -> ViewBatch:
+def _uncover(view: ViewBatch, bare: ViewBatch) -> ViewBatch:
     """``view`` without the depth of what covers ``bare``."""
     return replace(view, depth=torch.where(bare.valid & ~view.valid, 0.0, view.depth))
 
@@ -128,7 +128,7 @@ def _window(
     return turned_view(view, K, R, looks.width, looks.height)
 
 
-def _chosen(
+def _choose(
     first: Tensor,  # [B] bool
     a: ViewBatch,
     b: ViewBatch,

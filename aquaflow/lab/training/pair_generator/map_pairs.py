@@ -30,7 +30,7 @@ from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.mapped_scene import MappedScene
 from aquaflow.lab.training.pair_generator.render import BRIGHTEST, median_depth
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE, StoredPairs
-from aquaflow.lab.training.pairs import Pair, ViewBatch, joined
+from aquaflow.lab.training.pairs import Pair, ViewBatch, join
 
 NEAR = PairMotion(baseline=0.1, power=1.0, tilt=0.05, roll=0.15)
 """Of a view from a mapped one."""
@@ -82,7 +82,7 @@ class MapPairs:
         which = draw.whole(batch, below=len(self.maps)).tolist()
         numbers = draw.whole(batch, below=self.count).cpu()
         parts = [self.maps[m].pairs(numbers[i : i + 1]) for i, m in enumerate(which)]
-        return joined(parts).to(draw.device)
+        return join(parts).to(draw.device)
 
 
 @dataclass
@@ -104,7 +104,7 @@ class MapPool(StoredPairs):
         """The map, read when it is first needed: not where all pairs are on disk."""
         return MappedScene(self.map_file)
 
-    def rendered(self, shard: int) -> Pair:
+    def render(self, shard: int) -> Pair:
         draw = Draw(self.seed * STRIDE + shard)
         found: list[Pair] = []
         for _ in range(ATTEMPTS):
@@ -112,7 +112,7 @@ class MapPool(StoredPairs):
             if pair is not None:
                 found.append(pair)
             if len(found) == SHARD:
-                return joined(found)
+                return join(found)
         raise InputError(
             f"the map {self.map_file} shows too few places well from two views; leave it out"
         )
@@ -132,7 +132,7 @@ def drawn_pair(draw: Draw, scene: MappedScene, width: int, height: int) -> Pair 
     pair = Pair(a, b)
     if not _is_covered(b) or float(overlap(pair)) < LEAST_OVERLAP:
         return None
-    return _exposed(pair)
+    return _expose(pair)
 
 
 def _second_camera(draw: Draw, scene: MappedScene, a: ViewBatch) -> Tensor:
@@ -156,7 +156,7 @@ def _is_covered(view: ViewBatch) -> bool:
     return float(view.valid.float().mean()) >= LEAST_COVERED
 
 
-def _exposed(pair: Pair) -> Pair:
+def _expose(pair: Pair) -> Pair:
     """Radiances of the level that generated ones have, the same factor for both views."""
     bright = torch.quantile(pair.a.image, BRIGHT_QUANTILE).clamp_min(1e-3)
     a, b = (

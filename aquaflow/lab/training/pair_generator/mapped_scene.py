@@ -61,21 +61,21 @@ class MappedScene:
         height: int,
     ) -> ViewBatch:
         """The map's radiance, valid where it is solid and mapped views saw it at that range."""
-        drawn = self._drawn(K, T_wc, width, height)
+        drawn = self._draw(K, T_wc, width, height)
         away = (self.T_wc[:, :3, 3] - T_wc[0, :3, 3]).norm(dim=1)
         nearest = away.argsort(stable=True)[:NEIGHBOURS].tolist()
-        witnesses = joined_views([self.mapped(number) for number in nearest])
+        witnesses = joined_views([self.render_mapped(number) for number in nearest])
         repeated = joined_views([drawn] * len(nearest))
         seen = correspondences(Pair(repeated, witnesses)).visible.sum(0) >= WITNESSES
         return ViewBatch(drawn.image, drawn.depth, K, T_wc, drawn.valid & seen[None])
 
-    def mapped(self, number: int) -> ViewBatch:
+    def render_mapped(self, number: int) -> ViewBatch:
         """The map as drawn from a mapped view, valid where it is solid."""
         if number not in self._seen:
             real = self._mapped[number].camera
             width, height = REAL_WIDTH, round(REAL_WIDTH * real.height / real.width)
             K = torch.from_numpy(real.scaled(width, height).K).float()[None]
-            self._seen[number] = self._drawn(K, self.T_wc[number][None], width, height)
+            self._seen[number] = self._draw(K, self.T_wc[number][None], width, height)
         return self._seen[number]
 
     def depth(
@@ -83,10 +83,10 @@ class MappedScene:
         number: Tensor,  # [1] int64
     ) -> Tensor:
         """[1] median of what a mapped view sees."""
-        return median_depth(self.mapped(int(number)))
+        return median_depth(self.render_mapped(int(number)))
 
     @torch.no_grad()
-    def _drawn(
+    def _draw(
         self,
         K: Tensor,  # [1, 3, 3] px
         T_wc: Tensor,  # [1, 4, 4]
@@ -102,7 +102,7 @@ class MappedScene:
         shown = show(scene.seen_from(view, viewmat), None, None, scene.renderer, view, viewmat)
         rays = camera.unproject(camera.pixel_centres())
         z = shown.z / torch.from_numpy(np.linalg.norm(rays, axis=-1)).float()
-        layers = [scene.balanced(shown.radiance), shown.alpha[..., None]]
+        layers = [scene.apply_white_balance(shown.radiance), shown.alpha[..., None]]
         layers.append((shown.alpha * z)[..., None])
         layers_chw = torch.cat(layers, -1).permute(2, 0, 1)[None]
         averaged = F.avg_pool2d(layers_chw, finer)

@@ -25,7 +25,7 @@ def spectral(
     return field / field.std(dim=(-1, -2), keepdim=True).clamp_min(1e-6)
 
 
-def stamped(
+def stamp(
     draw: Draw,
     size: int,
     share: Tensor,  # [B] of the texels that are the middle of a stamp
@@ -45,7 +45,7 @@ def stamped(
     return strewn.clamp(0.0, 1.0)
 
 
-def wrapped(
+def wrap(
     field: Tensor,  # [B, C, n, n] periodic
 ) -> Tensor:
     """[B, C, n + 1, n + 1] ready for ``periodic``: the first row and column once more."""
@@ -53,7 +53,7 @@ def wrapped(
 
 
 def periodic(
-    field: Tensor,  # [B, C, n + 1, n + 1] from ``wrapped``
+    field: Tensor,  # [B, C, n + 1, n + 1] from ``wrap``
     places: Tensor,  # [B, N, 2] in periods
 ) -> Tensor:
     """[B, C, N] bilinear values."""

@@ -33,17 +33,17 @@ SEE_THROUGH = (0.6, 1.0)
 
 def with_overlay(draw: Draw, pair: Pair) -> Pair:
     """The pair with one overlay per item; after the sensor."""
-    drawn = [_drawn(draw, *pair.a.depth.shape[-2:]) for _ in range(len(pair.a.K))]
+    drawn = [_draw(draw, *pair.a.depth.shape[-2:]) for _ in range(len(pair.a.K))]
     colour = draw.chance(0.7, len(drawn), 1, 1, 1).float()  # white, or black
     opacity = draw.uniform(len(drawn), 1, 1, 1, low=SEE_THROUGH[0], high=SEE_THROUGH[1])
     views = []
     for view, index in zip((pair.a, pair.b), (0, 1), strict=True):
         ink = torch.from_numpy(np.stack([both[index] for both in drawn])).to(draw.device)
-        views.append(_inked(view, ink.float()[:, None] / 255.0, colour, opacity))
+        views.append(_ink(view, ink.float()[:, None] / 255.0, colour, opacity))
     return Pair(*views)
 
 
-def _inked(
+def _ink(
     view: ViewBatch,
     ink: Tensor,  # [B, 1, H, W] in [0, 1]
     colour: Tensor,  # [B, 1, 1, 1]
@@ -54,7 +54,7 @@ def _inked(
     return replace(view, image=image, valid=view.valid & ~covered)
 
 
-def _drawn(
+def _draw(
     draw: Draw, height: int, width: int
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
     """[H, W] ink in [0, 255] of both pictures."""
@@ -75,11 +75,11 @@ def _drawn(
             cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, 1, cv2.LINE_AA)
     kind = numbers[-1] % 6
     for picture in (first, second):
-        _ruled(picture, kind)
+        _rule(picture, kind)
     return first, second
 
 
-def _ruled(
+def _rule(
     picture: npt.NDArray[np.uint8],  # [H, W], drawn on
     kind: int,
 ) -> None:

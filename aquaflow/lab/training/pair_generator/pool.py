@@ -26,6 +26,6 @@ class Pool(StoredPairs):
     def name(self) -> str:
         return f"pairs_{self.width}x{self.height}_{self.seed}"
 
-    def rendered(self, shard: int) -> Pair:
+    def render(self, shard: int) -> Pair:
         draw = Draw(self.seed * STRIDE + shard)
         return render_pairs(draw, SHARD, self.width, self.height, self.motion, self.detail)

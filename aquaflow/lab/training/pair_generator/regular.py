@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.noise import spectral, stamped
+from aquaflow.lab.training.pair_generator.noise import spectral, stamp
 
 CELLS = (3, 14)
 """Half the number of cells along a period; a whole even number of them keeps it periodic."""
@@ -37,7 +37,7 @@ def regular_albedo(draw: Draw, batch: int, size: int) -> Tensor:
     # Behind a net there is open water or a dim background, and nothing that belongs to a cell.
     background = torch.where(is_net, 0.3 * dirt, tile * dirt)[:, None]
     result = (colours[0] * background).lerp(colours[1] * dirt[:, None], lines[:, None])
-    growth = stamped(
+    growth = stamp(
         draw,
         size,
         draw.log_uniform(batch, low=1e-5, high=3e-4),

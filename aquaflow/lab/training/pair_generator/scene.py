@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.noise import periodic, spectral, wrapped
+from aquaflow.lab.training.pair_generator.noise import periodic, spectral, wrap
 from aquaflow.lab.training.pair_generator.regular import regular_albedo
 from aquaflow.lab.training.pair_generator.texture import Atlas, albedo, atlas
 
@@ -143,7 +143,7 @@ def _terrain(draw: Draw, batch: int, size: int) -> Terrain:
         0.0, 1.0
     )
     field = torch.stack([height + rocks, share], 1)
-    return Terrain(wrapped(field), draw.uniform(batch, low=5.0, high=12.0))
+    return Terrain(wrap(field), draw.uniform(batch, low=5.0, high=12.0))
 
 
 def _rock(draw: Draw, batch: int, size: int) -> Tensor:
@@ -187,7 +187,7 @@ def _light(draw: Draw, batch: int, size: int) -> Light:
         draw.chance(0.4, batch) * draw.uniform(batch, low=0.3, high=1.0),
         lamp,
         draw.chance(0.35, batch) * draw.uniform(batch, low=0.1, high=0.6),
-        wrapped(torch.exp(-4.0 * waves.abs())[:, None]),
+        wrap(torch.exp(-4.0 * waves.abs())[:, None]),
     )
 
 

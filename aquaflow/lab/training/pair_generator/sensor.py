@@ -26,13 +26,13 @@ SNOW_PER_PIXEL = (-0.003, 0.002)
 """Bright particles; none where the draw is negative."""
 
 
-def taken(
+def take_picture(
     draw: Draw,
     radiance: Tensor,  # [B, 3, H, W]
 ) -> Tensor:
     """[B, 3, H, W] in [0, 1]: the picture, each with its own exposure and white balance."""
-    image = _exposed(draw, radiance * _uneven(draw, radiance))
-    image = _blurred(draw, image + _snow(draw, image))
+    image = _expose(draw, radiance * _uneven(draw, radiance))
+    image = _blur(draw, image + _snow(draw, image))
     batch = len(image)
     image = image + draw.normal(*image.shape) * draw.log_uniform(
         batch, 1, 1, 1, low=NOISE[0], high=NOISE[1]
@@ -41,7 +41,7 @@ def taken(
     return (image * (1.0 + draw.normal(batch, 3, 1, 1, sigma=0.06))).clamp(0.0, 1.0)
 
 
-def _exposed(
+def _expose(
     draw: Draw,
     image: Tensor,  # [B, 3, H, W]
 ) -> Tensor:
@@ -77,7 +77,7 @@ def _snow(
     return light + far + near
 
 
-def _blurred(
+def _blur(
     draw: Draw,
     image: Tensor,  # [B, 3, H, W]
 ) -> Tensor:

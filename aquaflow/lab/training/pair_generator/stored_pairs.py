@@ -36,7 +36,7 @@ class StoredPairs(ABC):
         """Start of the files' names: that of all that their content follows from."""
 
     @abstractmethod
-    def rendered(self, shard: int) -> Pair:
+    def render(self, shard: int) -> Pair:
         """The SHARD pairs of a file: radiances without water."""
 
     def pairs(
@@ -59,9 +59,9 @@ class StoredPairs(ABC):
             return False
         self.folder.mkdir(parents=True, exist_ok=True)
         with torch.no_grad():
-            pair = self.rendered(shard)
+            pair = self.render(shard)
         with atomic_write(path) as stream:
-            torch.save(_packed(pair.a, "a") | _packed(pair.b, "b"), stream)
+            torch.save(_pack(pair.a, "a") | _pack(pair.b, "b"), stream)
         return True
 
     def _shard(self, shard: int) -> dict[str, Tensor]:
@@ -74,7 +74,7 @@ class StoredPairs(ABC):
         return self.folder / f"{self.name}_{shard:05d}.pt"
 
 
-def _packed(view: ViewBatch, name: str) -> dict[str, Tensor]:
+def _pack(view: ViewBatch, name: str) -> dict[str, Tensor]:
     """Radiance in 8 bits, depth in 16: a twentieth of a pixel at the widest parallax.
 
     A depth that water is drawn with but nothing is learnt from is stored as a negative one.

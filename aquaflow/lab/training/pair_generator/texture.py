@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.noise import spectral, stamped
+from aquaflow.lab.training.pair_generator.noise import spectral, stamp
 
 LEVELS = 7
 """Of the pyramid; the coarsest has 1/64 of the texels along a side."""
@@ -105,7 +105,7 @@ def albedo(draw: Draw, batch: int, size: int) -> Tensor:
         -draw.uniform(batch, 1, 1, low=6.0, high=25.0) * blobs.roll(size // 3, 1).abs()
     )
     result = result * (1.0 - draw.uniform(batch, 1, 1, high=0.7) * cracks)[:, None]
-    strewn = stamped(
+    strewn = stamp(
         draw,
         size,
         draw.log_uniform(batch, low=3e-5, high=3e-3),

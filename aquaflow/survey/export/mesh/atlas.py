@@ -79,7 +79,7 @@ def lay_out(mesh: TriangleMesh, texel: float) -> AtlasLayout:
     return AtlasLayout(np.concatenate(source), places, np.concatenate(corners), *size.tolist())
 
 
-def painted(
+def paint(
     mesh: TriangleMesh,
     layout: AtlasLayout,
     colour: Colour,

@@ -80,7 +80,7 @@ class Blocks:
         """
         keys = np.empty(0, np.int64)
         for number in range(len(surfaces.views)):
-            keys = np.union1d(keys, _touched(surfaces, number, voxel))
+            keys = np.union1d(keys, _touch(surfaces, number, voxel))
             if len(keys) > MOST_BLOCKS:
                 raise InputError(
                     f"voxels of {voxel:g} would be more than {MOST_BLOCKS * BLOCK**3 // 10**6} "
@@ -88,7 +88,7 @@ class Blocks:
                 )
             if progress is not None:
                 progress(number + 1, len(surfaces.views))
-        self._blocks = _unpacked(keys)
+        self._blocks = _unpack(keys)
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -96,17 +96,17 @@ class Blocks:
 
     def chunks(self) -> Iterator[Chunk]:
         """Every chunk that holds a block, in a fixed order."""
-        for chunk in _unpacked(np.unique(_packed(self._blocks // CHUNK_BLOCKS))):
+        for chunk in _unpack(np.unique(_pack(self._blocks // CHUNK_BLOCKS))):
             first = chunk * CHUNK_BLOCKS
             inside = (self._blocks >= first) & (self._blocks <= first + CHUNK_BLOCKS)
             yield Chunk(first * BLOCK, self._blocks[inside.all(axis=1)] * BLOCK)
 
     def chunk_count(self) -> int:
         """How many chunks there are."""
-        return len(np.unique(_packed(self._blocks // CHUNK_BLOCKS)))
+        return len(np.unique(_pack(self._blocks // CHUNK_BLOCKS)))
 
 
-def _touched(surfaces: ViewSurfaces, number: int, voxel: float) -> Integers:
+def _touch(surfaces: ViewSurfaces, number: int, voxel: float) -> Integers:
     """Keys of the blocks within the truncation of what one view shows."""
     points, normals, sigmas = surfaces.points(number, STRIDE_PX)
     reach = truncation(sigmas, voxel)[:, None] * normals
@@ -119,13 +119,13 @@ def _touched(surfaces: ViewSurfaces, number: int, voxel: float) -> Integers:
     # A surface that lies within a voxel of a block's side needs the block behind it, too.
     low = np.floor((places - 1.0) / BLOCK).astype(np.int64)
     high = np.floor((places + 1.0) / BLOCK).astype(np.int64)
-    pairs = np.unique(np.stack([_packed(low), _packed(high)], axis=1), axis=0)
-    low, high = _unpacked(pairs[:, 0]), _unpacked(pairs[:, 1])
+    pairs = np.unique(np.stack([_pack(low), _pack(high)], axis=1), axis=0)
+    low, high = _unpack(pairs[:, 0]), _unpack(pairs[:, 1])
     corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.unique(np.concatenate([_packed(np.where(c, high, low)) for c in corners]))
+    return np.unique(np.concatenate([_pack(np.where(c, high, low)) for c in corners]))
 
 
-def _packed(
+def _pack(
     coordinates: Integers,  # [N, 3]
 ) -> Integers:
     """[N] numbers in whose order x comes first, then y, then z."""
@@ -133,7 +133,7 @@ def _packed(
     return np.asarray((x << 2 * BITS) | (y << BITS) | z)
 
 
-def _unpacked(
+def _unpack(
     keys: Integers,  # [N]
 ) -> Integers:
     """[N, 3]"""

@@ -18,17 +18,17 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
 from aquaflow.dive.png import encoded_png
 from aquaflow.dive.posed_views import read_posed_views
-from aquaflow.survey.export.mesh.atlas import lay_out, painted
+from aquaflow.survey.export.mesh.atlas import lay_out, paint
 from aquaflow.survey.export.mesh.blocks import Blocks
 from aquaflow.survey.export.mesh.colouring import batches, look_at, shown_colours
-from aquaflow.survey.export.mesh.fusion import fused
+from aquaflow.survey.export.mesh.fusion import fuse
 from aquaflow.survey.export.mesh.glb import write_glb
 from aquaflow.survey.export.mesh.placed_mesh import PlacedMesh, Texture
 from aquaflow.survey.export.mesh.surface import SurfaceBuilder, require_marching_cubes
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
 from aquaflow.survey.export.ortho.colours import Colours
-from aquaflow.survey.export.ortho.grid import rounded
+from aquaflow.survey.export.ortho.grid import round_to_digits
 
 Array = npt.NDArray[np.float64]
 Kind = Literal["ply", "obj", "glb"]
@@ -110,7 +110,9 @@ def export_mesh(
     scale, report = frame.T_nm.scale, progress or _nothing
     drawn = drawn_surfaces(mapper, scale)
     views = ViewSurfaces(posed, drawn, path.parent, partial(report, "views"))
-    surface = fused_surface(views, resolution or rounded(VOXEL_PX * views.footprint), report)
+    surface = fused_surface(
+        views, resolution or round_to_digits(VOXEL_PX * views.footprint), report
+    )
     through = views.median_range if water and mapper.medium.active else None
     colours = Colours(mapper, scale, through)
 
@@ -120,7 +122,7 @@ def export_mesh(
         return shown_colours(colours, look_at(views, places, surface.voxel))
 
     seen = "without water" if through is None else f"through {through:.3g} {where.unit} of water"
-    placed = _placed(surface, where, seen)
+    placed = _place_mesh(surface, where, seen)
     if kind == "ply":
         vertices = surface.mesh.vertices
         found = [colour(vertices[part])[0] for part in batches(len(vertices))]
@@ -128,7 +130,7 @@ def export_mesh(
         files, size = [path], None
     else:
         layout = lay_out(surface.mesh, surface.voxel / VOXEL_PX)
-        picture = painted(surface.mesh, layout, colour, partial(report, "texture"))
+        picture = paint(surface.mesh, layout, colour, partial(report, "texture"))
         texture, size = Texture(layout, picture), (layout.width, layout.height)
         files = [path]
         if kind == "obj":
@@ -154,7 +156,7 @@ def fused_surface(views: ViewSurfaces, voxel: float, report: Progress) -> FusedS
     blocks = Blocks(views, voxel, partial(report, "blocks"))
     builder = SurfaceBuilder(voxel)
     for done, chunk in enumerate(blocks.chunks()):
-        builder.add(chunk, fused(views, chunk, voxel, LEAST_VIEWS))
+        builder.add(chunk, fuse(views, chunk, voxel, LEAST_VIEWS))
         report("fusion", done + 1, blocks.chunk_count())
     mesh = builder.mesh()
     known = _sigmas(views, mesh, voxel, in_pixels=True) <= MOST_SIGMA_PX
@@ -179,7 +181,7 @@ def _sigmas(
     return np.concatenate(found)
 
 
-def _placed(surface: FusedSurface, where: Placement, seen: str) -> PlacedMesh:
+def _place_mesh(surface: FusedSurface, where: Placement, seen: str) -> PlacedMesh:
     """The mesh in the coordinates that it is written in."""
     origin = np.zeros(3)
     if where.epsg is not None:
@@ -290,16 +292,16 @@ def _lines(mesh: PlacedMesh, texture: Texture, material: str) -> Iterator[str]:
     yield f"mtllib {material}\no {MATERIAL}\n"
     layout = texture.layout
     upwards = layout.uv() * (1.0, -1.0) + (0.0, 1.0)
-    yield from _formatted("v %.5f %.5f %.5f\n", mesh.positions)
-    yield from _formatted("vt %.6f %.6f\n", upwards)
-    yield from _formatted("vn %.4f %.4f %.4f\n", mesh.normals)
+    yield from _format_rows("v %.5f %.5f %.5f\n", mesh.positions)
+    yield from _format_rows("vt %.6f %.6f\n", upwards)
+    yield from _format_rows("vn %.4f %.4f %.4f\n", mesh.normals)
     yield f"usemtl {MATERIAL}\ns 1\n"
     corners = layout.source[layout.faces] + 1, layout.faces + 1
     table = np.stack([corners[0], corners[1], corners[0]], axis=-1).reshape(len(mesh.faces), 9)
-    yield from _formatted("f %d/%d/%d %d/%d/%d %d/%d/%d\n", table)
+    yield from _format_rows("f %d/%d/%d %d/%d/%d %d/%d/%d\n", table)
 
 
-def _formatted(
+def _format_rows(
     line: str,
     values: npt.NDArray[np.generic],  # [N, C]
 ) -> Iterator[str]:

@@ -35,7 +35,7 @@ class ChunkDistances:
     too few views say anything of."""
 
 
-def fused(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) -> ChunkDistances:
+def fuse(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) -> ChunkDistances:
     """Distances of ``chunk.voxels()``, each known to ``least_views`` views at least."""
     voxels = chunk.voxels()
     low, high = voxels.min(axis=0) * voxel, voxels.max(axis=0) * voxel

@@ -45,16 +45,16 @@ def write_glb(path: Path, mesh: PlacedMesh, texture: Texture) -> None:
         np.ascontiguousarray(layout.faces, "<u4"),
     ]
     data = [*(part.tobytes() for part in parts), encoded_png(texture.picture)]
-    described = json.dumps(_described(mesh, parts, data), separators=(",", ":"), allow_nan=False)
-    text = _filled(described.encode(), b" ")
-    sizes = [len(_filled(each, b"\0")) for each in data]
+    described = json.dumps(_describe(mesh, parts, data), separators=(",", ":"), allow_nan=False)
+    text = _fill(described.encode(), b" ")
+    sizes = [len(_fill(each, b"\0")) for each in data]
     whole = 12 + 8 + len(text) + 8 + sum(sizes)
     with atomic_write(path) as stream:
         stream.write(struct.pack("<4sII", MAGIC, VERSION, whole))
         stream.write(struct.pack("<I4s", len(text), JSON_CHUNK) + text)
         stream.write(struct.pack("<I4s", sum(sizes), BINARY_CHUNK))
         for each in data:
-            stream.write(_filled(each, b"\0"))
+            stream.write(_fill(each, b"\0"))
 
 
 def _float32(
@@ -63,17 +63,17 @@ def _float32(
     return np.ascontiguousarray(values, "<f4")
 
 
-def _filled(data: bytes, filler: bytes) -> bytes:
+def _fill(data: bytes, filler: bytes) -> bytes:
     return data + filler * (-len(data) % ALIGNMENT)
 
 
-def _described(
+def _describe(
     mesh: PlacedMesh,
     parts: list[npt.NDArray[Any]],  # [K, C] positions, normals, texture places; [M, 3] triangles
     data: list[bytes],
 ) -> dict[str, Any]:
     """The JSON of a file: one mesh, one material, one picture, and what coordinates mean."""
-    starts = np.cumsum([0, *(len(_filled(each, b"\0")) for each in data)]).tolist()
+    starts = np.cumsum([0, *(len(_fill(each, b"\0")) for each in data)]).tolist()
     targets = [VERTICES, VERTICES, VERTICES, INDICES, None]
     views = [
         {"buffer": 0, "byteOffset": start, "byteLength": len(each)}

@@ -58,7 +58,7 @@ class GroundSplats:
     def __init__(self, mapper: Mapper, ground: Ground) -> None:
         """With a decoder, each Gaussian is as the view nearest to it sees it."""
         self._renderer: Renderer = mapper.renderer
-        self._splats = splats_of(mapper).transformed(ground.T_gm)
+        self._splats = splats_of(mapper).transform(ground.T_gm)
         self._reach = RADIUS_SIGMAS * self._splats.scales.max(axis=1, initial=0.0)
 
     @property

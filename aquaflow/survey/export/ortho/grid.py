@@ -96,6 +96,6 @@ class Grid:
         return np.stack(np.meshgrid(x, y), axis=-1)
 
 
-def rounded(length: float) -> float:
+def round_to_digits(length: float) -> float:
     """``length`` with few digits."""
     return float(f"{length:.{DIGITS}g}")

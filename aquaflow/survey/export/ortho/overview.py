@@ -11,7 +11,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.colours import Colours
 from aquaflow.survey.export.ortho.drawing import GroundSplats
-from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
+from aquaflow.survey.export.ortho.grid import Grid, GridTile, round_to_digits
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
 from aquaflow.telemetry.world_frame import WorldFrame
 
@@ -40,7 +40,7 @@ def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
 
     ground = ground_of(frame, mapper.views)
     low, high, distance = _extent(mapper, ground)
-    pixel = rounded(float((high - low).max()) / LONGER_SIDE_PX)
+    pixel = round_to_digits(float((high - low).max()) / LONGER_SIDE_PX)
     grid = Grid.around(low, high, pixel, low)
     splats, colours = GroundSplats(mapper, ground), Colours(mapper, ground.T_gm.scale, None)
     picture = np.zeros((grid.height, grid.width, 4), np.uint8)

@@ -155,14 +155,14 @@ class ViewRanges:
         around = ((self._low - size <= high) & (self._high + size >= low)).all(axis=1)
         for number in np.flatnonzero(around).tolist():
             z = self._of(number)
-            inside, rows, columns, ranges = self._projected(number, points, margin_px)
+            inside, rows, columns, ranges = self._project(number, points, margin_px)
             shown = z[rows, columns]
             hidden = (shown > 0.0) & (ranges > (1.0 + SAME_RANGE) * shown)
             farthest = min(float(z.max()), FAR * self.median_range)
             count[inside[~hidden & (ranges <= farthest)]] += 1
         return count
 
-    def _projected(
+    def _project(
         self,
         number: int,
         points: Array,  # [M, 3] on the ground
@@ -192,7 +192,7 @@ class ViewRanges:
         points: Array,  # [M, 3] on the ground
     ) -> tuple[npt.NDArray[np.intp], Array, Array]:
         """Numbers [K] of the points that a view sees, unit vectors [K, 3] to them, ranges [K]."""
-        inside, rows, columns, ranges = self._projected(number, points)
+        inside, rows, columns, ranges = self._project(number, points)
         offset = points[inside] - self._poses[number].t
         z = self._of(number)
         same = np.abs(z[rows, columns] - ranges) <= SAME_RANGE * ranges

@@ -17,7 +17,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.survey.export.ortho.colours import Colours
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
 from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
-from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
+from aquaflow.survey.export.ortho.grid import Grid, GridTile, round_to_digits
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
@@ -36,7 +36,7 @@ HEIGHT_SIGMA_PX = 0.5
 SPREAD_SHARE = 0.75
 """1 sigma of a height over the spread of the heights within the pixel. Both were chosen on surveys
 of sand and two reefs, so that the stated intervals hold the truth as often as they say
-(docs/measurements.md#orthos)."""
+(notes/measurements.md#orthos)."""
 SIGMA_IS = (
     f"of where the rays of the views that see the pixel meet, each known to {HEIGHT_SIGMA_PX:g} "
     f"pixel of its picture, and {SPREAD_SHARE:g} of the spread of the map's heights within the "
@@ -86,7 +86,7 @@ def export_survey(
     mapper, frame = dive.filled_map(), dive.frame
     ground = ground_of(frame, mapper.views)
     ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
-    side = resolution or rounded(ranges.footprint)
+    side = resolution or round_to_digits(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
     grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
     through = ranges.median_range if water and mapper.medium.active else None

@@ -19,7 +19,7 @@ from aquaflow.lab.bench.render.contenders import Timed
 from aquaflow.lab.bench.render.interactions import count_interactions
 from aquaflow.lab.bench.render.parts import parts_of, time_parts
 from aquaflow.lab.bench.render.rows import row_of
-from aquaflow.lab.bench.render.timing import Sample, interleaved, time_renderer
+from aquaflow.lab.bench.render.timing import Sample, interleave, time_renderer
 from aquaflow.render.contract import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from aquaflow.render.example_scene import Size, height_field
 from aquaflow.render.native.build import supported_isas
@@ -89,9 +89,9 @@ def test_a_renderer_that_tells_no_stages_has_none() -> None:
 def test_repeats_are_interleaved_and_start_with_another_job_each() -> None:
     order: list[int] = []
     jobs = [lambda k=k: (order.append(k), k)[1] for k in range(3)]
-    assert interleaved(jobs, 2) == [[0, 0], [1, 1], [2, 2]]
+    assert interleave(jobs, 2) == [[0, 0], [1, 1], [2, 2]]
     assert order == [0, 1, 2, 1, 2, 0]
-    assert interleaved(jobs[:0], 2) == []
+    assert interleave(jobs[:0], 2) == []
 
 
 def test_a_row_has_medians_rates_and_shares_of_the_peak() -> None:

@@ -23,7 +23,7 @@ from aquaflow.lab.training.pair_generator.map_pairs import (
 )
 from aquaflow.lab.training.pair_generator.mapped_scene import MappedScene
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
-from aquaflow.lab.training.pairs import Pair, joined
+from aquaflow.lab.training.pairs import Pair, join
 from tests.lab.training.small_maps import small_dive
 from tests.mapping.mapping_scenes import FLOOR_M, path, pose
 
@@ -55,7 +55,7 @@ def pair(scene: MappedScene) -> Pair:
     """Some that the map covers."""
     draw = Draw(3)
     drawn = [drawn_pair(draw, scene, WIDTH, HEIGHT) for _ in range(24)]
-    return joined([each for each in drawn if each is not None])
+    return join([each for each in drawn if each is not None])
 
 
 def level_K(focal_px: float) -> torch.Tensor:
@@ -115,7 +115,7 @@ def test_what_too_few_views_saw_is_shown_and_not_learnt_from(tmp_path: Path) -> 
 
 def test_files_keep_which_depths_are_not_to_be_learnt(dive: Path, tmp_path: Path) -> None:
     maps = pairs_of([dive], tmp_path)
-    rendered = maps.maps[0].rendered(0)
+    rendered = maps.maps[0].render(0)
     stored = maps.maps[0].pairs(torch.arange(SHARD))
     assert torch.equal(stored.b.valid, rendered.b.valid)
     assert bool((~stored.b.valid & (stored.b.depth > 0)).any())

@@ -19,7 +19,7 @@ from aquaflow.lab.training.pair_generator.drawing import (
 from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.render import BRIGHTEST, median_depth, render_pairs
 from aquaflow.lab.training.pair_generator.scene import Detail
-from aquaflow.lab.training.pair_generator.sensor import taken
+from aquaflow.lab.training.pair_generator.sensor import take_picture
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE
 from aquaflow.lab.training.pair_generator.water import MOST_ATTENUATION, random_water
 from aquaflow.lab.training.pairs import Pair
@@ -61,7 +61,7 @@ def test_no_water_is_so_murky_that_nothing_is_seen(clear: Pair) -> None:
 
 @pytest.mark.parametrize("level", [0.0, 1e-3, 1.0, 1e4])
 def test_a_picture_is_between_black_and_white_whatever_the_light(level: float) -> None:
-    image = taken(Draw(2), torch.full((3, 3, HEIGHT, WIDTH), level))
+    image = take_picture(Draw(2), torch.full((3, 3, HEIGHT, WIDTH), level))
     assert bool(torch.isfinite(image).all())
     assert float(image.min()) >= 0.0
     assert float(image.max()) <= 1.0
