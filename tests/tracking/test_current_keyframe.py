@@ -36,8 +36,10 @@ def snowed(poses: Sequence[Sim3], which: Sequence[int]) -> KnownPrior:
     prior = told(poses)
     plain, hidden = prior.decode, [prior.views[i].T_wc for i in which]
 
-    def holed(a: KnownView, b: KnownView, predicted: np.ndarray | None = None) -> KnownPair:
-        pair = plain(a, b, predicted)
+    def holed(
+        a: KnownView, b: KnownView, predicted: np.ndarray | None = None, alone: bool = False
+    ) -> KnownPair:
+        pair = plain(a, b, predicted, alone)
         rng = np.random.default_rng(len(prior.predictions))
         for view in (a, b):
             if any(view.T_wc is T for T in hidden):

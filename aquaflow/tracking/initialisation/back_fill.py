@@ -15,7 +15,6 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.tracking.pose.expected_matches import expected_matches
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
@@ -32,26 +31,29 @@ class BackFilledFrame:
     encoding: Encoding
     solved: Matched
     at: CurrentKeyframe
-    """The keyframe or frame that the pose is relative to."""
+    """The keyframe or frame that was matched."""
     T_fk: Sim3
     """From the keyframe of all poses to this frame."""
 
     def as_keyframe(
         self, keyframe_tracker: KeyframeTracker, camera: CameraModel
-    ) -> tuple[CurrentKeyframe, Sim3]:
-        """The frame as a keyframe with the transferred depths, against which others are posed;
-        T_fk."""
+    ) -> CurrentKeyframe:
+        """The frame as a keyframe with the transferred depths, against which others are posed."""
         pointmap, _ = keyframe_tracker.pointmap(self.at, self.solved, camera)
         frame, sub_map = self.frame, self.at.keyframe.sub_map
         # In a store of its own: the dive's keyframes are others.
         keyframe = KeyframeStore().add(
             frame.index, frame.t_ns, self.encoding, Sim3.identity(), pointmap, sub_map
         )
-        return CurrentKeyframe(keyframe), self.T_fk
+        return CurrentKeyframe(keyframe, motion=self.at.motion)
 
 
 class BackFill:
-    """Goes from the newest frame back; does not change the keyframe."""
+    """Goes from the newest frame back; does not change the keyframe.
+
+    A frame at which a keyframe would be due takes its place for those before it, with depths of its
+    own: the camera may have come from out of the keyframe's view.
+    """
 
     def __init__(
         self,
@@ -67,6 +69,8 @@ class BackFill:
         self._indices = frozenset(frame.index for frame in frames)
         self._at, self._camera = replace(at, motion=at.motion.inverse()), camera
         self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
+        self._near, self._T_nk = self._at, Sim3.identity()
+        """What frames are matched to, and its pose in the keyframe."""
         self._last: BackFilledFrame | None = None
 
     def waiting_frames(self, waiting: Sequence[Frame]) -> list[Frame]:
@@ -85,25 +89,42 @@ class BackFill:
         if placed is None:
             return Tracked.as_lost(frame, at.keyframe.sub_map)
         self._last = placed
-        matches = placed.solved.pair.matches
-        if placed.at is not at:  # those are of another picture
-            matches = expected_matches(at.keyframe.pointmap, placed.T_fk, self._camera)
-        at.moved_to(placed.T_fk, matches)
+        if placed.at is at:
+            at.moved_to(placed.T_fk, placed.solved.pair.matches)
+        at.T_fk = placed.T_fk
         return at.tracked_result(frame, FrameClass.COMMON, placed.solved.quality)
 
     def _place(self, frame: Frame) -> BackFilledFrame | None:
-        """At the keyframe; where the frame no longer shows that, at the frame placed before."""
+        """At what was matched last; from where a keyframe would be due, or where the frame no
+        longer shows that, at the frame placed before."""
         encoding = self._prior.encode(frame.image, self._camera, frame.mask)
-        solved = self._keyframe_tracker.place(self._at, encoding, self._camera)
-        if solved is not None:
-            return BackFilledFrame(frame, encoding, solved, self._at, solved.estimate.T)
-        if self._last is None:
-            return None
-        at, T_ak = self._last.as_keyframe(self._keyframe_tracker, self._camera)
-        solved = self._keyframe_tracker.place(at, encoding, self._camera)
+        if self._is_due():
+            self._go_on_at_last()
+        solved = self._keyframe_tracker.place(self._near, encoding, self._camera)
+        if solved is None and self._go_on_at_last():
+            solved = self._keyframe_tracker.place(self._near, encoding, self._camera)
         if solved is None:
             return None
-        return BackFilledFrame(frame, encoding, solved, at, solved.estimate.T @ T_ak)
+        near = self._near
+        if near is not self._at:
+            self._keyframe_tracker.take(near, solved, self._camera)
+        return BackFilledFrame(frame, encoding, solved, near, solved.estimate.T @ self._T_nk)
+
+    def _is_due(self) -> bool:
+        """True if the frame placed last would have become a keyframe."""
+        last, classify = self._last, self._keyframe_tracker.classify
+        return last is not None and (
+            classify(last.at, last.solved, self._camera) is FrameClass.KEYFRAME
+        )
+
+    def _go_on_at_last(self) -> bool:
+        """Match to the frame placed last from now on; False if there is none, or it is so yet."""
+        last = self._last
+        if last is None:
+            return False
+        self._near = last.as_keyframe(self._keyframe_tracker, self._camera)
+        self._T_nk, self._last = last.T_fk, None
+        return True
 
     def all(self, frames: Sequence[Frame], until: Deadline | None = None) -> list[Tracked]:
         """Every one of ``frames``, those that are left; the oldest first. Where the time does not
