@@ -106,7 +106,7 @@ class LensEquations:
         self._H_pp = 1e-9 + np.bincount(point, weights * np.sum(along**2, axis=1), count)
         self._g_p = np.bincount(point, weights * np.sum(along * error, axis=1), count)
         by_point = np.einsum("mr,mrk->mk", along, self._wJ)
-        self._H_pc = _sum_words(point[:, None] * width + self._columns, by_point, count * width)
+        self._H_pc = _add_up(point[:, None] * width + self._columns, by_point, count * width)
         self._H_pc = self._H_pc.reshape(count, width)
         self._by_match = np.einsum("mrk,mr->mk", self._wJ, error)
 
@@ -130,7 +130,7 @@ class LensEquations:
     ) -> Array:
         """[C] of the ``points``, their depths eliminated."""
         rows, width = points[self._observations.point], self._H_pc.shape[1]
-        direct = _sum_words(self._columns[rows], self._by_match[rows], width)
+        direct = _add_up(self._columns[rows], self._by_match[rows], width)
         gain = self._g_p[points] / self._H_pp[points]
         return np.asarray(direct - gain @ self._H_pc[points])
 
@@ -204,7 +204,7 @@ def _columns(observations: LensObservations, views: int) -> Indices:
     return np.concatenate([*blocks, lens], axis=1)
 
 
-def _sum_words(
+def _add_up(
     where: Indices,  # [...] below size
     values: Array,  # [...]
     size: int,

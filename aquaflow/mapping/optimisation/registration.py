@@ -2,7 +2,9 @@
 
 Gauss-Newton over the six numbers of a left tangent of the view matrix. The derivatives of the
 drawing are differences of drawings, each from a pose that moves the picture by a fraction of a
-pixel: six drawings and no gradient of the renderer. They are kept while the pose hardly moves.
+pixel: six drawings and no gradient of the renderer. They are kept while the pose hardly moves, so
+that most steps take one drawing where ``optimise.minimise``, which linearises after every step,
+would take seven; and the sums over pixels stay on the renderer's device.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 
 Point-to-plane ICP over the seven parameters of a similarity (Y. Chen, G. Medioni, "Object modelling
 by registration of multiple range images" (1992)), with Tukey's weights, so that what changed has no
-say. Its covariance allows for errors that neighbours share: residuals are summed over blocks of the
-ground before they are squared (the cluster-robust "sandwich": H. White, Econometrica 48 (1980); K.-
-Y. Liang, S. Zeger, Biometrika 73 (1986)).
+say. Pairs are found anew and their reach narrows at every step, so that there is no one cost for
+``optimise.minimise`` to reduce. Its covariance allows for errors that neighbours share: residuals
+are summed over blocks of the ground before they are squared (the cluster-robust "sandwich": H.
+White, Econometrica 48 (1980); K.- Y. Liang, S. Zeger, Biometrika 73 (1986)).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The judge of an adjustment: reprojection error of points that took no part in it.
 
-Their depths are triangulated from the poses that are judged, so no depth of a pointmap is asked.
+Their depths are triangulate from the poses that are judged, so no depth of a pointmap is asked.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def _each(
 
 
 def _start_depths(matches: AnchorMatches, poses: Sim3Batch) -> Array:
-    """[P] depths of the pointmap; triangulated where it has none."""
+    """[P] depths of the pointmap; triangulate where it has none."""
     unknown = ~np.isfinite(matches.variance)
     if not unknown.any():
         return matches.rho

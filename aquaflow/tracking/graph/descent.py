@@ -2,6 +2,12 @@
 
 The active set starts at what is new and grows, in doubling reach, while a pose at its rim would
 move by more than a tolerance.
+
+Why not ``optimise.minimise``: its problem has one set of unknowns and one cost, while here the set
+grows and the loops' kernel tightens (graduated non-convexity) on the way, and a factor serves
+several steps. Measured, a loop over 20 keyframes of a dive of 200 and of 1000, admission included:
+17 and 20 ms of CPU time; the shared descent over all poses, without admission, 14 and 43 ms. A loop
+over all 1000: 86 and 60 ms, so that the shared one gains where everything moves, which is rare.
 """
 
 from __future__ import annotations

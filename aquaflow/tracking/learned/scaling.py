@@ -3,7 +3,9 @@
 A network's ranges have a unit of their own, are off by a slope across the picture, and seldom have
 the error that it states. All three are found where the keyframe's depths are triangulated: scale
 and slope by robust least squares, and the factor of the error by the spread that is left. Errors of
-neighbours are alike, so that however many pixels are compared, they count as few.
+neighbours are alike, so that however many pixels are compared, they count as few. The fit is linear
+but for its weights, which follow from a noise of two parts, stated and own: its loop is three lines
+here, where ``optimise.minimise`` would need a problem of its own.
 
 Networks that know inverse depth up to scale and shift get their shift there as well (affine.py).
 """
