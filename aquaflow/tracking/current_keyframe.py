@@ -9,6 +9,7 @@ left, that one is taken up again: hovering adds none.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -279,6 +280,20 @@ class KeyframeTracker:
             except InputError:
                 continue  # a keyframe that cannot be read back is skipped
             return CurrentKeyframe(keyframe, T_fk=solved.estimate.T, matches=solved.pair.matches)
+        return None
+
+    def tracked_at(
+        self, keyframes: Sequence[Keyframe], frame: Frame, encoding: Encoding, camera: CameraModel
+    ) -> Tracked | None:
+        """A frame at the first of ``keyframes`` that shows it; no keyframe is changed."""
+        for keyframe in keyframes:
+            try:
+                solved = self._wide_steps.shown_by(keyframe, encoding, camera)
+            except InputError:
+                continue  # a keyframe that cannot be read back is skipped
+            if solved is not None:
+                there = CurrentKeyframe(keyframe, T_fk=solved.estimate.T)
+                return there.tracked_result(frame, FrameClass.COMMON, solved.quality)
         return None
 
     def take_up(self, back: CurrentKeyframe) -> None:

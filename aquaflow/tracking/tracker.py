@@ -36,6 +36,11 @@ ExpectedMotion: TypeAlias = Callable[[Keyframe, int, int, Sim3], Sim3 | None]
 """The camera's motion between two moments (ns) as telemetry has it, in units of the keyframe; the
 last argument is the motion between the two frames before."""
 
+LAST_LOOKS = 60
+"""Lost frames that a replay looks at again at its end; bounds memory and time, some 2 s each."""
+NEAR_IN_TIME = 3
+"""Keyframes that such a frame is looked for in."""
+
 
 class Tracker:
     """One camera, one stream; a loss starts a new sub-map instead of failing."""
@@ -82,6 +87,10 @@ class Tracker:
         """Pairs of keyframes, the later one first, whose relative pose was noted."""
         self._edges = Step()
         """Links and revisits of the step that is being made."""
+        self._reasons: dict[int, str] = {}
+        """Why frames that wait for a last look are lost."""
+        self._ending = False
+        """True once the last frame was tracked: what is lost then leaves."""
 
     def track(self, frame: Frame) -> Step:
         """Track a frame; no frame is finished by it while it waits, several may be afterwards.
@@ -108,7 +117,37 @@ class Tracker:
     def finish(self, until: Deadline | None = None) -> Step:
         """Finish the waiting frames after a last attempt to pose them, as far as there is time."""
         step = self._step("tracking", None, lambda: self._begin() + self._back_fills.all(until))
-        return replace(step, frames=step.frames + self._waiting.give_up(self._as_lost))
+        self._ending = True
+        last = self._step("last look", None, lambda: self._look_once_more(until))
+        return replace(step, frames=step.frames + last.frames)
+
+    def _look_once_more(self, until: Deadline | None) -> list[Tracked]:
+        """The frames without a pose, each at the keyframes that are next to it in time, and then at
+        one that looks like it: more are known now than when it was lost."""
+        frames = self._waiting.take_all()
+        if self.camera is None:
+            return []
+        tracked = []
+        for frame in frames:
+            if until is not None and until.over:
+                break
+            with self._failures.contain("last look", frame.index):
+                found = self._shown_somewhere(frame, self.camera)
+                tracked += [] if found is None else [found]
+        return tracked
+
+    def _shown_somewhere(self, frame: Frame, camera: CameraModel) -> Tracked | None:
+        encoding = self._prior.encode(frame.image, camera, frame.mask)
+        keyframes = self._keyframes.keyframes
+        near = sorted(keyframes, key=lambda each: abs(each.frame_index - frame.index))
+        looked_at = near[:NEAR_IN_TIME]
+        tracked = self._keyframe_tracker.tracked_at(looked_at, frame, encoding, camera)
+        if tracked is not None or self._places is None:
+            return tracked
+        alike = self._places.of_frame(encoding, camera)
+        if alike is None or alike.keyframe in looked_at:
+            return None
+        return self._keyframe_tracker.tracked_at([alike.keyframe], frame, encoding, camera)
 
     @property
     def lost(self) -> bool:
@@ -135,10 +174,28 @@ class Tracker:
         if run.failed and frame is not None:
             self._waiting.put([frame], Wait.IN_HAND)
         edges, self._edges = self._edges, Step()
-        return replace(edges, frames=self._waiting.settle(decided, self._as_lost))
+        return replace(edges, frames=self._kept(self._waiting.settle(decided, self._as_lost)))
+
+    def _kept(self, leaving: list[Tracked]) -> list[Tracked]:
+        """Those that leave; in a replay, frames that are lost wait for its end."""
+        if self._ending or not self._worker.in_step:
+            return leaving
+        room = LAST_LOOKS - self._waiting.count(Wait.FOR_A_LAST_LOOK)
+        lost = [
+            each
+            for each in leaving
+            if each.frame_class is FrameClass.LOST and not self._failures.reason(each.frame.index)
+        ][: max(room, 0)]
+        for each in lost:
+            self._reasons[each.frame.index] = each.reason
+            self._waiting.enter(each.frame)
+        self._waiting.put((each.frame for each in lost), Wait.FOR_A_LAST_LOOK)
+        waits = {each.frame.index for each in lost}
+        return [each for each in leaving if each.frame.index not in waits]
 
     def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
-        return Tracked.as_lost(frame, self.sub_map, self._failures.reason(frame.index) or reason)
+        known = self._failures.reason(frame.index) or self._reasons.get(frame.index)
+        return Tracked.as_lost(frame, self.sub_map, known or reason)
 
     def _track(self, frame: Frame) -> list[Tracked]:
         encoding = self._encode(frame)

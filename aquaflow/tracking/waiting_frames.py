@@ -28,6 +28,8 @@ class Wait(Enum):
     """A keyframe; initialisation continues without this frame."""
     INITIALISING = "initialising"
     """Enough parallax to initialisation's reference, or it is that reference."""
+    FOR_A_LAST_LOOK = "for a last look"
+    """A replay's end, when every keyframe is known."""
     IN_IDLE_TIME = "in idle time"
     """Idle time of a live run; its keyframe exists."""
 
@@ -98,8 +100,8 @@ class WaitingFrames:
         in_hand.clear()
         return leaving
 
-    def give_up(self, as_lost: Callable[[Frame, str], Tracked]) -> list[Tracked]:
-        """Remove all frames, without a pose."""
+    def take_all(self) -> list[Frame]:
+        """Move all frames in hand; these frames, in the order of their numbers."""
         for state in Wait:
             self.move(state, Wait.IN_HAND)
-        return self.settle([], as_lost)
+        return sorted(self.of(Wait.IN_HAND), key=lambda frame: frame.index)

@@ -9,7 +9,10 @@ from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.tracking import tracker as tracker_module
 from aquaflow.tracking.frames import FrameClass
+from aquaflow.tracking.initialisation.back_fill import BackFill
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from tests.tracking.tracked_clips import (
@@ -22,7 +25,14 @@ from tests.tracking.tracked_clips import (
     run,
     told,
 )
-from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
+from tests.tracking.tracking_scenes import (
+    KnownPrior,
+    KnownView,
+    SeaFloor,
+    depth_map,
+    filmed,
+    pose,
+)
 
 
 def test_the_plane_of_these_tests_is_the_plane_of_the_scenes() -> None:
@@ -57,12 +67,33 @@ def test_thinned_frames_are_filled_in_too() -> None:
 def test_frames_that_wait_for_ever_are_given_up_oldest_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """But the first of them wait for a replay's last look, and keep the reason."""
     monkeypatch.setitem(BOUNDS, Wait.FOR_A_KEYFRAME, Bound(3, "no parallax yet"))
+    monkeypatch.setattr(tracker_module, "LAST_LOOKS", 1)
     prior = told(path(8), blind=range(8))
     tracker = Tracker(prior, KeyframeStore(), QUICK)
     given_up = [[t.frame.index for t in tracker.track(f).frames] for f in prior.frames(SMALL)]
-    assert given_up == [[], [], [], [], [0], [1], [2], [3]]
-    assert sorted(t.frame.index for t in tracker.finish().frames) == [4, 5, 6, 7]
+    assert given_up == [[], [], [], [], [], [1], [2], [3]]
+    last = {t.frame.index: t.reason for t in tracker.finish().frames}
+    assert sorted(last) == [0, 4, 5, 6, 7]
+    assert last[0] == "no parallax yet"
+
+
+def test_a_lost_frame_is_looked_for_once_more_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where keyframes on both sides of it are known; here neither tracking nor back-fill did."""
+    poses = [pose((0.0, 0.0, 0.0), (0.06 * i, 0.02 * i, 0.0)) for i in range(7)]
+    tracker = Tracker(ClassicalPrior(), KeyframeStore(), TrackingConfig())
+    follow = tracker._follow
+    monkeypatch.setattr(
+        tracker, "_follow", lambda frame, *rest: None if frame.index == 5 else follow(frame, *rest)
+    )
+    monkeypatch.setattr(BackFill, "_place", lambda self, frame: None)
+    tracked = [t for f in filmed(SeaFloor(), poses) for t in tracker.track(f).frames]
+    assert 5 not in {t.frame.index for t in tracked}
+    tracked += tracker.finish().frames
+    assert sorted(t.frame.index for t in tracked) == list(range(7))
+    assert all(t.T_wc is not None for t in tracked)
+    assert error_share(tracked, poses) < 0.02
 
 
 @pytest.mark.parametrize(("widths", "mapping"), [(1e-4, True), (10.0, False)], ids=["low", "high"])
