@@ -103,7 +103,10 @@ class Clear:
         self._means, self._wxyz, self._scales = map(
             to_device, (splats.means, splats.wxyz, splats.scales)
         )
-        self._opacities, self._colours = to_device(splats.opacities), sent(bounded[:, 0] / 255.0)
+        self._opacities, self._colours = (
+            to_device(splats.opacities),
+            to_device(bounded[:, 0] / 255.0),
+        )
 
     @torch.no_grad()
     def __call__(self, T_wc: Sim3) -> Picture:
