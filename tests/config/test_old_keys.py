@@ -13,9 +13,9 @@ import yaml
 from aquaflow.base.errors import ConfigError
 from aquaflow.config import Config, MappingConfig, load_config
 from aquaflow.config.old_keys import CONSTANTS, GONE, without_old_keys
-from aquaflow.config.presets import PRESETS, configured
+from aquaflow.config.presets import PRESETS, load_configured
 from aquaflow.config.service import ServiceConfig
-from aquaflow.config.stage import StageConfig, stages_of, validated
+from aquaflow.config.stage import StageConfig, stages_of, validate
 from aquaflow.config.vehicle import VehicleConfig, load_any, load_vehicle
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import deserialise, serialise
@@ -94,7 +94,7 @@ def test_what_asks_for_the_lab_or_changes_nothing_is_not_told(
 def test_presets_python_and_a_dives_own_config_set_the_lab_without_a_word(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = configured(None, "paper", {"tracking": {"residual": "point"}}, "here")
+    settings = load_configured(None, "paper", {"tracking": {"residual": "point"}}, "here")
     assert (settings.mapping.decoder.enabled, settings.tracking.residual) == (True, "point")
     file = written(tmp_path, yaml.safe_dump(settings.model_dump(mode="json")))
     assert load_config(file, inside=True) == settings
@@ -113,7 +113,7 @@ def test_a_setting_that_is_a_constant_now_is_taken_out_and_its_value_told(
 ) -> None:
     caplog.set_level(logging.WARNING)
     same = without_old_keys(nested(path, CONSTANTS[path]), "here")
-    assert validated(VehicleConfig, same, "here") == VehicleConfig()
+    assert validate(VehicleConfig, same, "here") == VehicleConfig()
     assert caplog.records == []
     load_any(written(tmp_path, yaml.safe_dump(nested(path, -7))))
     (record,) = caplog.records
