@@ -1,7 +1,7 @@
 """What OpenCV's FFmpeg complains about, and FFmpeg's own program where OpenCV cannot convert.
 
 OpenCV returns True for pictures that its scaler refused: their memory holds whatever was there
-before. Only FFmpeg's log tells, so it is listened to, through FFmpeg's public ``av_log_set_callback``.
+before. Only FFmpeg's log tells, so it is listened to, through its public ``av_log_set_callback``.
 """
 
 from __future__ import annotations
