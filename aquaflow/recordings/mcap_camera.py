@@ -22,6 +22,7 @@ from aquaflow.geometry.camera import (
     guess_camera,
     has_unmeasured_port,
 )
+from aquaflow.recordings.camera_info import camera_of_info, info_topic, is_rectified
 from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
 from aquaflow.recordings.picture import UnreadablePictureError, received_as
@@ -86,7 +87,7 @@ class McapCamera:
         known = self._stated is not None and self._stated.calibrated
         self.camera: CameraModel | None = self._stated if known else None
         self.frame_count: int | None = self._count(self._messages.counts())
-        self.notes: list[str] = []
+        self.notes: list[str] = list(self._damage)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -156,7 +157,7 @@ class McapCamera:
     def _calibration(self) -> CameraModel | None:
         facts = self._messages.facts.get(f"camera:{self._base.strip('/')}")
         if facts is None:
-            return None
+            return None if self._ours else self._camera_info()
         try:
             fields = json.loads(facts["model"])
             if has_unmeasured_port(fields):
@@ -168,6 +169,26 @@ class McapCamera:
         except (KeyError, TypeError, ValueError, RecursionError):
             self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
             return None
+
+    def _camera_info(self) -> CameraModel | None:
+        """Of the CameraInfo of ROS that belongs to the topic."""
+        found: dict[str, McapMessage] = {}
+        for message in self._messages.heads():
+            name = "" if message.schema is None else message.schema.name.replace("/msg/", "/")
+            if name == "sensor_msgs/CameraInfo":
+                found.setdefault(message.topic, message)
+        topic = info_topic(self.topic, found)
+        if topic is None:
+            return None
+        try:
+            camera = camera_of_info(self._payloads.decode(found[topic]), is_rectified(self.topic))
+        except (UnreadablePayloadError, AttributeError, KeyError):
+            camera = "it cannot be read"
+        if isinstance(camera, str):
+            self._damage.append(f"{topic} is not used: {camera}")
+            return None
+        self._damage.append(f"the calibration of {self.topic} is that of {topic}")
+        return camera
 
     def _count(self, counts: dict[str, int] | None) -> int | None:
         if counts is None:

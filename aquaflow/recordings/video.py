@@ -170,6 +170,8 @@ class VideoFile:
             aspect = camera.width / camera.height * height / width
             if abs(aspect - 1.0) <= ASPECT_TOLERANCE:
                 self._facts.append(f"the calibration is {file}")
+                if (width, height) == (self.width, self.height):
+                    return camera
                 return camera.scaled(self.width, self.height)
         self._facts.append(
             f"{file} is for pictures of {camera.width} x {camera.height}, these are {self.width} x "
