@@ -32,6 +32,7 @@ from aquaflow.cli.console import (
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.dive import register as register_dive
 from aquaflow.cli.export import register as register_export
+from aquaflow.cli.inspect import register as register_inspect
 from aquaflow.cli.measure import register as register_measure
 from aquaflow.cli.prior import register as register_prior
 from aquaflow.cli.record import register as register_record
@@ -89,6 +90,7 @@ def map_command(
         Path | None, typer.Option(help="Picture of the camera's size: white is used, black not.")
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
+    topic: Annotated[str | None, typer.Option(help="Picture topic of a bag.")] = None,
     preset: Annotated[str | None, typer.Option(help=PRESETS)] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw.")] = None,
     threads: Annotated[int | None, typer.Option(help="Default: every core.")] = None,
@@ -138,6 +140,8 @@ def map_command(
             "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
             "log in a replay.yaml"
         )
+    if realtime and topic is not None:
+        raise InputError("--topic is for a replay; leave out --realtime")
     if in_site is not None:
         checked_site(in_site, out)
     if realtime:
@@ -145,7 +149,7 @@ def map_command(
             map_realtime(source, settings, calibration, out, overwrite, as_json, in_site), as_json
         )
         return
-    recording = open_recording(source, fps=settings.source.fps)
+    recording = open_recording(source, settings.source.fps, topic)
     given = open_telemetry(source, telemetry or (), telemetry_offset)
 
     from aquaflow.dive.replay import (
@@ -330,6 +334,7 @@ register_change(app)
 register_devices(app)
 register_dive(app)
 register_export(app)
+register_inspect(app)
 register_prior(app)
 register_record(app)
 register_report(app)

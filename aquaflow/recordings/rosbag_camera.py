@@ -79,8 +79,13 @@ class RosbagCamera:
         return is_bag(path)
 
     @classmethod
-    def open(cls, path: Path, fps: float | None = None, topic: str | None = None) -> RosbagCamera:
-        return cls(path, fps, topic)
+    def open(cls, path: Path, fps: float | None = None) -> RosbagCamera:
+        return cls(path, fps)
+
+    @classmethod
+    def topic_of(cls, path: Path, topic: str) -> RosbagCamera:
+        """Open ``topic`` of a bag; raises as the constructor."""
+        return cls(path, topic=topic)
 
     def name_of(self, index: int) -> str:
         """The bag's name and the picture's number, ``dive.bag#12``."""
