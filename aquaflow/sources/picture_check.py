@@ -22,12 +22,13 @@ MOST_SHARE = 0.5
 """Share of the pictures from which on something is said of them."""
 
 
-def oddities(pictures: Sequence[npt.NDArray[np.uint8]]) -> list[str]:
-    """Clauses on pictures [H, W, 3] that follow each other; none for usual ones."""
+def oddities(pictures: Sequence[npt.NDArray[np.uint8]], step: int = STEP) -> list[str]:
+    """Clauses on pictures [H, W, 3] that follow each other; none for usual ones. Every ``step``-th
+    pixel is looked at."""
     if not pictures:
         return []
     small = [
-        picture[::STEP, ::STEP].mean(axis=2)
+        picture[::step, ::step].mean(axis=2)
         for picture in pictures
         if picture.shape == pictures[0].shape
     ]
@@ -49,7 +50,7 @@ def oddities(pictures: Sequence[npt.NDArray[np.uint8]]) -> list[str]:
     elif repeated > MOST_SHARE * len(pairs):
         said.append(f"{repeated} of {count} pictures repeat the one before")
     cuts = sum(_correlation(a, b) < CUT for a, b in pairs)
-    if cuts:
+    if 0 < cuts <= MOST_SHARE * len(pairs):  # stills of a survey are all unlike
         said.append(f"the scene changes from one picture to the next {cuts} times")
     return said
 
