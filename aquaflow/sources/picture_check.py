@@ -44,7 +44,7 @@ def oddities(pictures: Sequence[npt.NDArray[np.uint8]], step: int = STEP) -> lis
     if flat > MOST_SHARE * count or count < 2:
         return said
     pairs = list(pairwise(small))
-    repeated = sum(bool((a == b).all()) for a, b in pairs)
+    repeated = sum(np.array_equal(a, b) for a, b in pairwise(pictures))
     if max(float(np.abs(grey - small[0]).mean()) for grey in small) < STILL:
         said.append("nothing moves: all pictures show the same")
     elif repeated > MOST_SHARE * len(pairs):
