@@ -16,7 +16,7 @@ from aquaflow.calibration.board import Board, Detector
 from aquaflow.calibration.fit import CalibrationFit, fit_lens, fit_port
 from aquaflow.calibration.views import Views, find_views
 from aquaflow.geometry.camera import CameraModel, DistortionModel
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera_file import save_camera, save_for_others
 from aquaflow.geometry.port import FlatPort
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame
@@ -126,7 +126,8 @@ def _pictures(source: Path) -> Iterator[tuple[str, npt.NDArray[np.uint8]]]:
 
 
 def write_calibration(found: Calibration, out: Path) -> list[Path]:
-    """Write ``camera.yaml``, ``calibration.json`` and ``residuals.png``; the files, in that order.
+    """Write ``camera.yaml``, ``calibration.json``, ``residuals.png``, and the camera for ROS and
+    for OpenCV; the files, in that order.
 
     Raises:
         InputError: the folder cannot be written to.
@@ -139,7 +140,7 @@ def write_calibration(found: Calibration, out: Path) -> list[Path]:
     save_camera(found.fit.camera, files[0])
     write_json(files[1], found.to_json())
     draw_residuals(found.views, found.fit, files[2])
-    return files
+    return files + save_for_others(found.fit.camera, out)
 
 
 # --------------------------------------------------------------------------------------------------

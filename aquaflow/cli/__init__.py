@@ -29,6 +29,7 @@ from aquaflow.cli.console import (
 )
 from aquaflow.cli.doctor import config, doctor_group
 from aquaflow.cli.export import export_group
+from aquaflow.cli.inspect import inspect
 from aquaflow.cli.lab import lab_group
 from aquaflow.cli.measure import measure_group
 from aquaflow.cli.record import record
@@ -117,6 +118,7 @@ def map_command(
         Path | None, typer.Option(help="Picture of the camera's size: white is used, black not.")
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
+    topic: Annotated[str | None, typer.Option(help="Picture topic of a bag.")] = None,
     preset: Annotated[str | None, typer.Option(help=PRESETS)] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw.")] = None,
     threads: Annotated[int | None, typer.Option(help="Default: every core.")] = None,
@@ -166,6 +168,8 @@ def map_command(
             "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
             "log in a replay.yaml"
         )
+    if realtime and topic is not None:
+        raise InputError("--topic is for a replay; leave out --realtime")
     if in_site is not None:
         checked_site(in_site, out)
     if realtime:
@@ -173,7 +177,7 @@ def map_command(
             map_realtime(source, settings, calibration, out, overwrite, as_json, in_site), as_json
         )
         return
-    recording = open_recording(source, fps=settings.source.fps)
+    recording = open_recording(source, settings.source.fps, topic)
     given = open_telemetry(source, telemetry or (), telemetry_offset)
 
     from aquaflow.dive.replay import (
@@ -218,6 +222,7 @@ def _print_summary(finished: Finished) -> None:
 HELP: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, str]]] = {
     "Recordings and live dives": {
         "map": (map_command, "Turn a recording into a dive: trajectory, map, water, report."),
+        "inspect": (inspect, "What would be read of a recording, and what is odd in it."),
         "run": (run_group(), "Map live on a vehicle; ask how the service is; finish a dive."),
         "record": (record, "Record cameras and telemetry, to map them later."),
     },

@@ -70,18 +70,18 @@ def in_words(found: FoundCamera | None, tracked: CameraModel, file: str) -> str:
     unknown = f"{guessed.fx:.0f} px is a guess, good to {UNKNOWN_PERCENT} %"
     if found is None:
         return (
-            f"no calibration was given, and too few pictures show the lens: the focal length of "
+            f"no calibration was used, and too few pictures show the lens: the focal length of "
             f"{unknown}, distortion ignored"
         )
     if not found.lens.known:
         return (
-            "no calibration was given, and the camera's motion does not determine its focal "
+            "no calibration was used, and the camera's motion does not determine its focal "
             f"length: {unknown}; turn the camera while filming, or calibrate it in water"
         )
     if found.used:
-        return f"no calibration was given: focal length found to be {found.words}"
+        return f"no calibration was used: focal length found to be {found.words}"
     return (
-        f"no calibration was given: the dive was mapped with a focal length of {tracked.fx:.0f} "
+        f"no calibration was used: the dive was mapped with a focal length of {tracked.fx:.0f} "
         f"px and no distortion; at its end the focal length was found to be {found.words}; give "
         f"{file} to the next dive as calibration"
     )

@@ -12,6 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from aquaflow.base.errors import InputError, NotMappedError, printable
 from aquaflow.base.profiler import pace
 from aquaflow.config import Config
@@ -38,6 +41,7 @@ from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
 from aquaflow.slam.finish_time import FinishTime
+from aquaflow.sources.picture_check import oddities
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
@@ -45,6 +49,9 @@ from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)
 
+
+LOOKED_AT, LOOKED_STEP = 30, 4
+"""Pictures that are kept in small, 10 kB each, until the dive's end."""
 
 UNCHECKED = (
     "whether the calibration fits could not be checked: too few keyframes see the same places "
@@ -106,6 +113,8 @@ class DiveRun:
         """Of every frame that was read: preparing, tracking and mapping it."""
         self.first_pose_s: float | None = None
         """Seconds from the start of the run."""
+        self._first_pictures: list[npt.NDArray[np.uint8]] = []
+        """Every ``LOOKED_STEP``-th pixel of them: what they show says why nothing was mapped."""
         self._name_of, self._trace = name_of, trace
         self._cpu_before_s = time.process_time()
 
@@ -129,6 +138,8 @@ class DiveRun:
         if prepared is None:
             return []
         self._keep(prepared)
+        if len(self._first_pictures) < LOOKED_AT:
+            self._first_pictures.append(prepared.image[::LOOKED_STEP, ::LOOKED_STEP].copy())
         decided = self.slam.process(prepared)
         self.decide(decided)
         self._time_frame(begun, decided)
@@ -305,6 +316,8 @@ class DiveRun:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
         if read < MIN_VIEWS:
             return f"{self.name} has {read} usable frames; a map needs at least {MIN_VIEWS}"
+        if odd := oddities(self._first_pictures, 1):
+            return f"{self.name}: none of {read} frames could be placed: {'; '.join(odd)}"
         return (
             f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
             "the camera must move sideways, see frames.csv for each frame"

@@ -24,6 +24,7 @@ from pydantic import (
 
 from aquaflow.base.errors import ConfigError, path_of_key, words_of
 from aquaflow.base.errors.plain_yaml import read_mapping
+from aquaflow.geometry.foreign_calibration import FISHEYE, values_of_file, values_of_yaml
 from aquaflow.geometry.port import Port
 from aquaflow.geometry.port_file import DomePortFile, FlatPortFile, PortFile, as_stated, port_of
 
@@ -205,14 +206,20 @@ class CameraFile(BaseModel):
 
 
 def load_camera(path: Path, inside: bool = False) -> CameraModel:
-    """Read a calibration; ``inside``: of a folder that others may have made.
+    """Read a calibration, ours or one of :mod:`aquaflow.geometry.foreign_calibration`; ``inside``:
+    of a folder that others may have made.
 
     Raises:
         InputError: the file is not there or is not YAML.
         ConfigError: a key is unknown, missing, or its value is out of range; or a port is named
             without its measures.
     """
-    data = read_mapping(path, "calibration", "compare it with docs/formats.md", inside)
+    data = None if inside else values_of_file(path)
+    if data is None:
+        data = read_mapping(path, "calibration", "compare it with docs/formats.md", inside)
+        data = values_of_yaml(path, data) or data
+    if data.get("distortion_model") in FISHEYE:
+        data["distortion_model"] = "fisheye"
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.recordings.decoder_log import DecoderLog
 
 NAL_START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """Start code of Annex B, and the first byte of the unit that follows."""
@@ -86,12 +87,16 @@ def decode_units(
     except (TypeError, cv2.error) as error:
         raise InputError("decoding recorded video needs opencv-python-headless 5") from error
     try:
-        while True:
-            decoded, bgr = capture.read()
-            if not decoded or not stream.read_but_not_decoded:
-                break
-            image = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-            yield stream.read_but_not_decoded.popleft(), np.asarray(image, np.uint8)
+        with DecoderLog() as decoder:
+            while True:
+                decoded, bgr = capture.read()
+                if not decoded or not stream.read_but_not_decoded:
+                    break
+                label, refused = stream.read_but_not_decoded.popleft(), decoder.refused()
+                if decoder.errors() or refused:
+                    yield label, None
+                    continue
+                yield label, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
     finally:
         capture.release()
     yield from ((label, None) for label in stream.read_but_not_decoded)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterator
+from datetime import datetime, timezone
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +17,15 @@ from aquaflow.base.errors import InputError, printable
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.recordings.picture import (
     EXTENSIONS,
+    TWELVE_BITS,
     UnreadablePictureError,
     decode_picture,
-    grey_16_white,
     probe_size,
     read_picture,
     received_as,
+    stated_white,
     to_rgb,
+    white_of_16,
 )
 from aquaflow.types import CameraModel, Dropped, Frame
 
@@ -57,10 +63,14 @@ class ImageFolder:
         self.files = _pictures_of(folder)
         self.frame_count: int | None = len(self.files)
         self._reasons: dict[int, str] = {}
+        self._facts: list[str] = []
         self.width, self.height = self._majority_size()
-        self._times_ns = _times_ns(_sidecar(folder, TIMESTAMPS), self.files, fps)
+        self._times_ns, source = _times_ns(_sidecar(folder, TIMESTAMPS), self.files, fps)
+        self._facts.append(source)
         calibration = _sidecar(folder, CALIBRATION)
         self.camera: CameraModel | None = load_camera(calibration) if calibration else None
+        if calibration is not None:
+            self._facts.append(f"the calibration is {calibration}")
         self._white: int | None = None
         self.notes: list[str] = []
         self._update_notes()
@@ -99,16 +109,23 @@ class ImageFolder:
                 self._update_notes()
         if index in self._reasons:
             return Dropped(index, t_ns, self._reasons[index])
-        if picture.ndim == 2 and self._white is None:
-            self._white = self._folder_white()
-        image = to_rgb(picture, self._white or 0)
+        if picture.dtype != np.uint8 and self._white is None:
+            self._white = self._folder_white(data)
+            self._update_notes()
+        image = to_rgb(picture, self._white or 1)
         camera = self.camera or guess_camera(image.shape[1], image.shape[0])
-        # 16-bit grey means nothing without the white of its folder.
-        encoded = received_as(data) if picture.ndim == 3 else None
+        # 16 bits mean nothing without the white of their folder.
+        encoded = received_as(data) if picture.dtype == np.uint8 else None
         return Frame(index, t_ns, t_ns, image, camera, encoded=encoded)
 
-    def _folder_white(self) -> int:
-        """White of the first 16-bit grey picture: one value for all, or brightness would jump."""
+    def _folder_white(self, first: bytes) -> int:
+        """White of the 16-bit pictures: one value for all, or brightness would jump; as the first
+        states it, else of all of them, up to one that needs all 16 bits."""
+        white = stated_white(first)
+        if white is not None:
+            self._facts.append(f"white is {white - 1} in pictures of 16 bits, as their header says")
+            return white
+        white = TWELVE_BITS
         for index in range(len(self.files)):
             if index in self._reasons:
                 continue
@@ -116,9 +133,14 @@ class ImageFolder:
                 picture = read_picture(self.files[index])
             except UnreadablePictureError:
                 continue
-            if picture.ndim == 2:
-                return grey_16_white(picture)
-        raise AssertionError("called for a folder that has a 16-bit grey picture")
+            if picture.dtype != np.uint8 and white_of_16(picture) > white:
+                white = 1 << 16
+                break
+        self._facts.append(
+            f"white is assumed to be {white - 1} in pictures of 16 bits: "
+            + ("none is brighter" if white == TWELVE_BITS else f"values above {TWELVE_BITS} occur")
+        )
+        return white
 
     def _majority_size(self) -> tuple[int, int]:
         """The most frequent size, the earlier on a tie; others are marked as dropped."""
@@ -142,9 +164,10 @@ class ImageFolder:
         return width, height
 
     def _update_notes(self) -> None:
+        self.notes = list(self._facts)
         if self._reasons:
             first = self._reasons[min(self._reasons)]
-            self.notes = [
+            self.notes += [
                 f"{len(self._reasons)} of {len(self.files)} pictures were left out; the first: "
                 f"{first}"
             ]
@@ -161,6 +184,9 @@ def _pictures_of(folder: Path) -> list[Path]:
             and file.is_file()
         ]
         if found:
+            times = [time_of_name(file.stem) for file in found]
+            if None not in times and len({time[0] for time in times if time}) == 1:
+                return sorted(found, key=lambda file: (time_of_name(file.stem), file.name))
             return sorted(found, key=_natural_key)
     raise InputError(
         f"{folder} holds no picture; give a folder with {', '.join(sorted(EXTENSIONS))} files or "
@@ -183,20 +209,97 @@ def _sidecar(folder: Path, name: str) -> Path | None:
     return None
 
 
-def _times_ns(stamps: Path | None, files: list[Path], fps: float | None) -> list[int]:
-    """Nanoseconds since the first picture, one for each picture."""
-    if stamps is None:
-        rate = DEFAULT_FPS if fps is None else fps
-        if not (np.isfinite(rate) and rate > 0.0):
-            raise InputError(f"a frame rate of {rate:g} pictures a second is not above zero")
-        return [round(index * NS_PER_S / rate) for index in range(len(files))]
-    seconds = _read_stamps(stamps)
-    if len(seconds) != len(files):
-        raise InputError(
-            f"{stamps} holds {len(seconds)} times for {len(files)} pictures; write one time in "
-            "seconds for each picture"
+DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]?"
+    r"([0-2]\d)[-_:.h]?([0-5]\d)[-_:.m]?([0-6]\d)(?:[.,](\d{1,9})|_?(\d{3}|\d{6}|\d{9}))?(?!\d)"
+)
+"""A date with a time of day, as ISO 8601, DJI and recorders write it."""
+EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|_?(\d{3}|\d{6}|\d{9}))?(?!\d)")
+"""Seconds since 1970 (2001 to 2033), with decimals, or as milli-, micro- or nanoseconds."""
+SECONDS = re.compile(r"(?<![\d.])(\d+)\.(\d{1,9})s?$")
+"""Seconds with decimals at the end of a name."""
+
+
+def time_of_name(stem: str) -> tuple[str, int] | None:
+    """What the time in a picture's name is, and its ns; None where the name holds none."""
+    if found := DATE.search(stem):
+        year, month, day, hour, minute, second = (int(part) for part in found.groups()[:6])
+        fraction = found[7] or found[8] or ""
+        with contextlib.suppress(ValueError):
+            moment = datetime(year, month, day, hour, minute, second, tzinfo=timezone.utc)
+            return "dates", int(moment.timestamp()) * NS_PER_S + _decimals_ns(fraction)
+    if found := EPOCH.search(stem):
+        return "seconds since 1970", int(found[1]) * NS_PER_S + _decimals_ns(
+            found[2] or found[3] or ""
         )
-    return [round((second - seconds[0]) * NS_PER_S) for second in seconds]
+    if found := SECONDS.search(stem):
+        return "seconds", int(found[1]) * NS_PER_S + _decimals_ns(found[2])
+    return None
+
+
+def _decimals_ns(digits: str) -> int:
+    return int(digits.ljust(9, "0"))
+
+
+def _times_ns(stamps: Path | None, files: list[Path], fps: float | None) -> tuple[list[int], str]:
+    """Nanoseconds since the first picture, one for each picture, and a sentence on their source."""
+    if stamps is not None:
+        seconds = _read_stamps(stamps)
+        if len(seconds) != len(files):
+            raise InputError(
+                f"{stamps} holds {len(seconds)} times for {len(files)} pictures; write one time in "
+                "seconds for each picture"
+            )
+        times = [round((second - seconds[0]) * NS_PER_S) for second in seconds]
+        return times, f"the times of the pictures are those of {stamps}"
+    if fps is not None:
+        if not (np.isfinite(fps) and fps > 0.0):
+            raise InputError(f"a frame rate of {fps:g} pictures a second is not above zero")
+        return _evenly(len(files), fps), f"the pictures have the {fps:g} a second that were given"
+    if (named := _increasing([time_of_name(file.stem) for file in files])) is not None:
+        kind, times = named
+        return times, f"the times of the pictures are the {kind} in their names"
+    if (taken := _increasing([_exif_time(file) for file in files])) is not None:
+        return taken[1], "the times of the pictures are those of their EXIF"
+    return _evenly(len(files), DEFAULT_FPS), (
+        f"the times of the pictures are not known: {DEFAULT_FPS:g} a second are assumed; give "
+        f"{TIMESTAMPS} or --fps"
+    )
+
+
+def _evenly(count: int, rate: float) -> list[int]:
+    return [round(index * NS_PER_S / rate) for index in range(count)]
+
+
+def _increasing(times: list[tuple[str, int] | None]) -> tuple[str, list[int]] | None:
+    """Kind and ns since the first, if all are of one kind and none is twice or earlier."""
+    known = [time for time in times if time is not None]
+    if len(known) < max(2, len(times)) or len({kind for kind, _ in known}) > 1:
+        return None
+    ns = [time for _, time in known]
+    if any(after <= before for before, after in pairwise(ns)):
+        return None
+    return known[0][0], [time - ns[0] for time in ns]
+
+
+EXIF_IFD, TAKEN, SUBSECONDS = 0x8769, 0x9003, 0x9291
+"""EXIF: the directory of the camera, when the picture was taken, and decimals of that."""
+
+
+def _exif_time(file: Path) -> tuple[str, int] | None:
+    from PIL import Image
+
+    if file.suffix.lower() not in (".jpg", ".jpeg", ".tif", ".tiff"):
+        return None
+    with warnings.catch_warnings(), contextlib.suppress(Exception):  # Pillow has many for bad EXIF
+        warnings.simplefilter("ignore")
+        with Image.open(file) as picture:
+            exif = picture.getexif().get_ifd(EXIF_IFD)
+        moment = datetime.strptime(str(exif[TAKEN]), "%Y:%m:%d %H:%M:%S")
+        whole = int(moment.replace(tzinfo=timezone.utc).timestamp())
+        digits = re.sub(r"\D", "", str(exif.get(SUBSECONDS, "")))[:9]
+        return "EXIF", whole * NS_PER_S + _decimals_ns(digits)
+    return None
 
 
 def _read_stamps(path: Path) -> list[float]:

@@ -22,6 +22,7 @@ from aquaflow.geometry.camera import (
     guess_camera,
     has_unmeasured_port,
 )
+from aquaflow.recordings.camera_info import camera_of_info, info_topic, is_rectified, preferred
 from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
 from aquaflow.recordings.picture import UnreadablePictureError, received_as
@@ -67,7 +68,7 @@ class McapCamera:
 
     specificity = 2
 
-    def __init__(self, path: Path, camera: str | None = None) -> None:
+    def __init__(self, path: Path, camera: str | None = None, topic: str | None = None) -> None:
         """Look for the first picture, of ``camera`` or of the first camera that there is.
 
         Raises:
@@ -76,7 +77,9 @@ class McapCamera:
         self.path = path
         self._messages = McapMessages(mcap_files(path))
         self._payloads = Payloads()
-        first, self.origin_ns = self._first_picture(camera)
+        if camera is None and topic is None:
+            topic = self._preferred()
+        first, self.origin_ns = self._first_picture(camera, topic)
         self.topic = first.topic
         self._base = first.topic.rpartition("/")[0]
         self._ours = OURS in self._messages.facts
@@ -86,7 +89,7 @@ class McapCamera:
         known = self._stated is not None and self._stated.calibrated
         self.camera: CameraModel | None = self._stated if known else None
         self.frame_count: int | None = self._count(self._messages.counts())
-        self.notes: list[str] = []
+        self.notes: list[str] = list(self._damage)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -95,6 +98,11 @@ class McapCamera:
     @classmethod
     def open(cls, path: Path, fps: float | None = None) -> McapCamera:
         return cls(path)
+
+    @classmethod
+    def topic_of(cls, path: Path, topic: str) -> McapCamera:
+        """Open ``topic`` of a recording; raises InputError if it has no pictures there."""
+        return cls(path, topic=topic)
 
     def name_of(self, index: int) -> str:
         """The recording's name and the picture's number, ``dive.mcap#12``."""
@@ -139,7 +147,15 @@ class McapCamera:
                 f"the mounting of the camera in {self.path.name} is damaged; give fusion.camera"
             ) from None
 
-    def _first_picture(self, camera: str | None) -> tuple[McapMessage, int]:
+    def _preferred(self) -> str | None:
+        """The picture topic that suits best, where there are several and none is ours."""
+        heads = list(self._messages.heads())
+        found = [each.topic for each in heads if picture_kind(each) is not None]
+        if OURS in self._messages.facts or len(found) < 2:
+            return None
+        return preferred((topic, 0) for topic in found)
+
+    def _first_picture(self, camera: str | None, topic: str | None) -> tuple[McapMessage, int]:
         """The first picture, and when it or a missing one before it was taken."""
         missing: dict[str, int] = {}
         for message in self._messages:
@@ -147,16 +163,26 @@ class McapCamera:
             kind = picture_kind(message)
             if name == "dropped":
                 missing.setdefault(base, message.publish_ns)
-            elif kind is not None and name != "mask" and camera in (None, base.strip("/")):
+            elif (
+                kind is not None
+                and name != "mask"
+                and camera in (None, base.strip("/"))
+                and topic in (None, message.topic)
+            ):
                 self._kind = kind
                 return message, missing.get(base, message.publish_ns)
         which = "" if camera is None else f" of camera '{camera}'"
-        raise InputError(f"{self.path} holds no picture{which}; give a recording with a camera")
+        which += "" if topic is None else f" on {topic}"
+        known = ", ".join(sorted(message.topic for message in self._messages.heads())) or "none"
+        raise InputError(
+            f"{self.path} holds no picture{which}; give a recording with a camera; its topics are: "
+            f"{known}"
+        )
 
     def _calibration(self) -> CameraModel | None:
         facts = self._messages.facts.get(f"camera:{self._base.strip('/')}")
         if facts is None:
-            return None
+            return None if self._ours else self._camera_info()
         try:
             fields = json.loads(facts["model"])
             if has_unmeasured_port(fields):
@@ -168,6 +194,26 @@ class McapCamera:
         except (KeyError, TypeError, ValueError, RecursionError):
             self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
             return None
+
+    def _camera_info(self) -> CameraModel | None:
+        """Of the CameraInfo of ROS that belongs to the topic."""
+        found: dict[str, McapMessage] = {}
+        for message in self._messages.heads():
+            name = "" if message.schema is None else message.schema.name.replace("/msg/", "/")
+            if name == "sensor_msgs/CameraInfo":
+                found.setdefault(message.topic, message)
+        topic = info_topic(self.topic, found)
+        if topic is None:
+            return None
+        try:
+            camera = camera_of_info(self._payloads.decode(found[topic]), is_rectified(self.topic))
+        except (UnreadablePayloadError, AttributeError, KeyError):
+            camera = "it cannot be read"
+        if isinstance(camera, str):
+            self._damage.append(f"{topic} is not used: {camera}")
+            return None
+        self._damage.append(f"the calibration of {self.topic} is that of {topic}")
+        return camera
 
     def _count(self, counts: dict[str, int] | None) -> int | None:
         if counts is None:

@@ -19,6 +19,9 @@ SUFFIX = ".mcap"
 RECORD_LIMIT = 1 << 28
 """bytes; a damaged length must not fill the memory."""
 
+HEAD = 2000
+"""Messages in which every topic shows itself: of 200 a second, those of 10 s."""
+
 ATTEMPTS = 2
 """At a chunk, which may hold a second of pictures."""
 
@@ -74,6 +77,14 @@ class McapMessages:
                 yield from self._messages(file, wanted)
             except OSError as error:
                 self.notes.append(f"{file.name} cannot be read: {error.strerror}")
+
+    def heads(self) -> Iterator[McapMessage]:
+        """The first message of every topic, as far as ``HEAD`` messages reach."""
+        seen: set[str] = set()
+        for _, message in zip(range(HEAD), self, strict=False):
+            if message.topic not in seen:
+                seen.add(message.topic)
+                yield message
 
     def counts(self) -> dict[str, int] | None:
         """Messages by topic from the files' summaries; None if one was cut off before it."""

@@ -8,8 +8,10 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.telemetry import AnyDevice
-from aquaflow.recordings.mcap_camera import McapCamera
-from aquaflow.recordings.mcap_messages import McapMessages, mcap_files
+from aquaflow.recordings.mcap_camera import McapCamera, Payloads, UnreadablePayloadError
+from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
+from aquaflow.recordings.rosbag import stamp_of
+from aquaflow.recordings.rosbag_telemetry import CONVERSIONS
 from aquaflow.recordings.telemetry_json import sample_from_json
 from aquaflow.recordings.telemetry_log import DecodedReads, Read
 from aquaflow.types import KINDS, TelemetrySample
@@ -48,9 +50,13 @@ class McapTelemetry:
         return telemetry
 
     def samples(self) -> Iterator[TelemetrySample]:
-        """The samples as they were decoded during the dive."""
+        """The samples as they were decoded during the dive; of ROS's messages, as of a bag."""
         self.invalid = 0
-        for message in self._messages.of(lambda topic: topic.startswith(TELEMETRY)):
+        payloads = Payloads()
+        for message in self._messages:
+            if not message.topic.startswith(TELEMETRY):
+                yield from self._of_ros(message, payloads)
+                continue
             kind = message.topic.rpartition("/")[2]
             try:
                 if kind not in KINDS:
@@ -64,6 +70,20 @@ class McapTelemetry:
                 t_ns=sample.t_ns - self.origin_ns,
                 arrival_ns=sample.arrival_ns - self.origin_ns,
             )
+
+    def _of_ros(self, message: McapMessage, payloads: Payloads) -> list[TelemetrySample]:
+        name = "" if message.schema is None else message.schema.name
+        convert = CONVERSIONS.get(name if "/msg/" in name else name.replace("/", "/msg/", 1))
+        if convert is None:
+            return []
+        arrival_ns = message.log_ns - self.origin_ns
+        try:
+            fields = payloads.decode(message)
+            t_ns = min(stamp_of(fields, message.log_ns) - self.origin_ns, arrival_ns)
+            return convert(fields, t_ns, arrival_ns, message.topic.strip("/"))
+        except (UnreadablePayloadError, ValueError, ZeroDivisionError, AttributeError):
+            self.invalid += 1
+            return []
 
     def link_bytes(self) -> Iterator[Read]:
         """Every read of every link, as it came."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -58,9 +59,9 @@ def read_picture(path: Path) -> npt.NDArray[np.uint8 | np.int32]:
 
 
 def decode_picture(data: bytes) -> npt.NDArray[np.uint8 | np.int32]:
-    """Decode to [H, W, 3] uint8 RGB, or, for 16-bit grey, to [H, W] int32 as stored.
+    """Decode to [H, W, 3] uint8 RGB; what has 16 bits to int32 as stored, [H, W] or [H, W, 3].
 
-    Grey becomes RGB, transparency is dropped, 16-bit colour keeps its high byte.
+    Grey of 8 bits becomes RGB, transparency is dropped.
 
     Raises:
         UnreadablePictureError: the data are damaged or their pixel type is unknown.
@@ -73,12 +74,63 @@ def decode_picture(data: bytes) -> npt.NDArray[np.uint8 | np.int32]:
             with Image.open(io.BytesIO(data)) as picture:
                 if picture.mode in GREY_16_MODES:
                     return np.asarray(picture).astype(np.int32)
+                if _has_16_bits(picture, data):
+                    return _colour_16(data)
                 if picture.mode != "F":
                     return np.array(picture.convert("RGB"), dtype=np.uint8)
                 mode = picture.mode
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise UnreadablePictureError("is damaged or cut off") from error
     raise UnreadablePictureError(f"has pixels of type {mode}; convert it to 8 bits per channel")
+
+
+PNG_DEPTH, TIFF_DEPTH, TIFF_MOST, DNG_WHITE = 24, 258, 281, 50717
+"""Where files say their bits a channel, and the value of white: an offset, and tags."""
+
+
+def _has_16_bits(picture: Any, data: bytes) -> bool:
+    """True for colour that Pillow would cut to its high byte."""
+    if picture.format == "PNG":
+        return data[PNG_DEPTH] == 16
+    return picture.format == "TIFF" and 16 in picture.tag_v2.get(TIFF_DEPTH, ())
+
+
+def _colour_16(data: bytes) -> npt.NDArray[np.int32]:
+    """Through OpenCV, as Pillow has no colour of 16 bits."""
+    import cv2
+
+    loud = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        flags = cv2.IMREAD_UNCHANGED
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    finally:
+        cv2.utils.logging.setLogLevel(loud)
+    if bgr is None or bgr.dtype != np.uint16:
+        raise UnreadablePictureError("is damaged or cut off")
+    return bgr.astype(np.int32) if bgr.ndim == 2 else bgr[..., 2::-1].astype(np.int32)
+
+
+def stated_white(data: bytes) -> int | None:
+    """The value of white that a file of 16 bits states: PNG's sBIT, TIFF's and DNG's tags."""
+    from PIL import Image
+
+    if data.startswith(b"\x89PNG"):
+        at = data[:4096].find(b"sBIT")
+        return None if at < 0 or not 8 < data[at + 4] <= 16 else 1 << data[at + 4]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(io.BytesIO(data)) as picture:
+                tags = getattr(picture, "tag_v2", {})
+                for tag in (DNG_WHITE, TIFF_MOST):
+                    value = tags.get(tag)
+                    most = max(value) if isinstance(value, tuple) else value
+                    if most is not None and 255 < most < 1 << 16:
+                        return int(most) + 1
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            return None
+    return None
 
 
 def received_as(data: bytes) -> EncodedPicture | None:
@@ -92,19 +144,19 @@ def received_as(data: bytes) -> EncodedPicture | None:
     return None
 
 
-def grey_16_white(
-    grey: npt.NDArray[np.uint8 | np.int32],  # [H, W] as from read_picture
+def white_of_16(
+    picture: npt.NDArray[np.uint8 | np.int32],  # [H, W, ...] as from read_picture
 ) -> int:
     """The value that is white in 16-bit pictures like this one: 2^12 or 2^16."""
-    return TWELVE_BITS if int(grey.max()) < TWELVE_BITS else 1 << 16
+    return TWELVE_BITS if int(picture.max()) < TWELVE_BITS else 1 << 16
 
 
 def to_rgb(
-    picture: npt.NDArray[np.uint8 | np.int32],  # [H, W, 3] or [H, W] as from read_picture
+    picture: npt.NDArray[np.uint8 | np.int32],  # as from read_picture
     white: int,
 ) -> npt.NDArray[np.uint8]:
-    """[H, W, 3] uint8 RGB; 16-bit grey is scaled so that ``white`` becomes 256."""
-    if picture.ndim == 3:
-        return picture.astype(np.uint8, copy=False)
-    grey = np.clip(picture * 256 // white, 0, 255).astype(np.uint8)
-    return np.repeat(grey[:, :, None], 3, axis=2)
+    """[H, W, 3] uint8 RGB; 16 bits are scaled so that ``white`` becomes 256."""
+    if picture.dtype != np.uint8:
+        picture = np.clip(picture.astype(np.int32) * 256 // white, 0, 255).astype(np.uint8)
+    rgb = picture if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
+    return np.ascontiguousarray(rgb, dtype=np.uint8)

@@ -6,11 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.recordings.picture import (
-    TWELVE_BITS,
     UnreadablePictureError,
     decode_picture,
-    grey_16_white,
     to_rgb,
+    white_of_16,
 )
 
 CHANNELS = {
@@ -33,7 +32,7 @@ def compressed_picture(data: bytes) -> npt.NDArray[np.uint8]:
         UnreadablePictureError: it is damaged.
     """
     picture = decode_picture(data)
-    return to_rgb(picture, grey_16_white(picture) if picture.ndim == 2 else TWELVE_BITS)
+    return to_rgb(picture, white_of_16(picture))
 
 
 def raw_picture(
@@ -49,7 +48,7 @@ def raw_picture(
         rows = np.frombuffer(data, np.uint8)[: height * step].reshape(height, step)
         if name in GREY_16:
             grey = rows[:, : 2 * width].copy().view("<u2").astype(np.int32)
-            return to_rgb(grey, grey_16_white(grey))
+            return to_rgb(grey, white_of_16(grey))
         if name in BAYER or name in YUYV:
             return _convert(rows, height, width, name)
         channels = CHANNELS[name]

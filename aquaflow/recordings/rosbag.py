@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.recordings.camera_info import preferred
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -82,11 +83,19 @@ def messages_in(
         yield message
 
 
-def picture_connections(reader: AnyReader) -> list[Connection]:
-    """Those of the first picture topic by name that holds messages."""
-    found = [c for c in reader.connections if c.msgtype in PICTURES and c.msgcount > 0]
-    first = min((c.topic for c in found), default=None)
-    return [connection for connection in found if connection.topic == first]
+def picture_topics(reader: AnyReader) -> dict[str, int]:
+    """Messages of the topics that hold pictures."""
+    counts: dict[str, int] = {}
+    for each in reader.connections:
+        if each.msgtype in PICTURES and each.msgcount > 0:
+            counts[each.topic] = counts.get(each.topic, 0) + each.msgcount
+    return counts
+
+
+def picture_connections(reader: AnyReader, topic: str | None = None) -> list[Connection]:
+    """Those of a picture topic; None: of the one that suits best."""
+    chosen = topic or preferred(picture_topics(reader).items())
+    return [c for c in reader.connections if c.msgtype in PICTURES and c.topic == chosen]
 
 
 def decode(reader: AnyReader, connection: Connection, data: bytes) -> Any | None:
@@ -108,9 +117,9 @@ def stamp_of(message: Any, received_ns: int) -> int:
     return stamp_ns if abs(stamp_ns - received_ns) <= LONGEST_DELAY_NS else received_ns
 
 
-def origin_of(reader: AnyReader) -> int:
+def origin_of(reader: AnyReader, topic: str | None = None) -> int:
     """Time of the first picture; that of the bag's first message where it holds no picture."""
-    pictures = picture_connections(reader)
+    pictures = picture_connections(reader, topic)
     for connection, received_ns, data in messages_in(reader, pictures, []):
         return stamp_of(decode(reader, connection, data), received_ns)
     return int(reader.start_time)

@@ -10,18 +10,25 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, printable
-from aquaflow.geometry.camera import CameraModel, DistortionModel, guess_camera
+from aquaflow.geometry.camera import CameraModel, guess_camera
+from aquaflow.recordings.camera_info import (
+    CAMERA_INFO,
+    camera_of_info,
+    info_topic,
+    is_rectified,
+    preferred,
+)
 from aquaflow.recordings.picture import UnreadablePictureError, received_as
 from aquaflow.recordings.picture_message import compressed_picture, raw_picture
 from aquaflow.recordings.rosbag import (
     COMPRESSED,
-    PICTURES,
     decode,
     is_bag,
     messages_in,
     open_bag,
     origin_of,
     picture_connections,
+    picture_topics,
     stamp_of,
 )
 from aquaflow.sources import is_asked
@@ -30,41 +37,42 @@ from aquaflow.types import Dropped, EncodedPicture, Frame
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-"""Message with a camera's calibration."""
-
-DISTORTIONS: dict[str, DistortionModel] = {
-    "plumb_bob": "radtan",
-    "rational_polynomial": "radtan",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
-}
-"""ROS's distortion models, and the names here of those that are known."""
-
 
 class RosbagCamera:
-    """The first picture topic by name; times count from its first picture."""
+    """One picture topic of a bag; times count from its first picture."""
 
     specificity = 2
 
-    def __init__(self, path: Path, fps: float | None = None) -> None:
-        """Read the bag's index and calibration.
+    def __init__(self, path: Path, fps: float | None = None, topic: str | None = None) -> None:
+        """Read the bag's index and calibration; of ``topic``, or of the one that suits best.
 
         Raises:
-            InputError: the bag is damaged or holds no picture.
+            InputError: the bag is damaged, or holds no picture (of ``topic``).
         """
         self.path = path
-        self.notes: list[str] = []
         with open_bag(path) as reader:
-            pictures = picture_connections(reader)
-            if not pictures:
-                raise InputError(f"the bag {path} holds no picture; give a bag with a camera")
-            self.topic = pictures[0].topic
-            self.frame_count: int | None = sum(connection.msgcount for connection in pictures)
-            self.origin_ns = origin_of(reader)
-            self.camera = _calibration(reader, self.topic)
-            others = {c.topic for c in reader.connections if c.msgtype in PICTURES} - {self.topic}
-        self._other_topics = sorted(others)
+            counts = picture_topics(reader)
+            if not counts:
+                known = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
+                raise InputError(
+                    f"the bag {path} holds no picture; give a bag with a camera; its topics are: "
+                    f"{known}"
+                )
+            if topic is not None and topic not in counts:
+                raise InputError(
+                    f"the bag {path} has no pictures on {topic}; there are: "
+                    f"{', '.join(sorted(counts))}"
+                )
+            self.topic = topic or preferred(counts.items()) or ""
+            self.frame_count: int | None = counts[self.topic]
+            self.origin_ns = origin_of(reader, self.topic)
+            self.camera, said = _calibration(reader, self.topic)
+        self._facts = [said]
+        if others := sorted(set(counts) - {self.topic}):
+            self._facts.append(
+                f"{self.topic} is used; also there: {', '.join(others)} (choose by --topic)"
+            )
+        self.notes = list(self._facts)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -74,6 +82,11 @@ class RosbagCamera:
     def open(cls, path: Path, fps: float | None = None) -> RosbagCamera:
         return cls(path, fps)
 
+    @classmethod
+    def topic_of(cls, path: Path, topic: str) -> RosbagCamera:
+        """Open ``topic`` of a bag; raises as the constructor."""
+        return cls(path, topic=topic)
+
     def name_of(self, index: int) -> str:
         """The bag's name and the picture's number, ``dive.bag#12``."""
         return f"{printable(self.path.name)}#{index}"
@@ -82,11 +95,9 @@ class RosbagCamera:
         self, every: int = 1, start: int = 0, stop: int | None = None
     ) -> Iterator[Frame | Dropped]:
         """The pictures ``start, start + every, ...`` below ``stop``, in the order of reception."""
-        self.notes = []
-        if self._other_topics:
-            self.notes.append(f"{self.topic} is used; also there: {', '.join(self._other_topics)}")
+        self.notes = list(self._facts)
         with open_bag(self.path) as reader:
-            messages = messages_in(reader, picture_connections(reader), self.notes)
+            messages = messages_in(reader, picture_connections(reader, self.topic), self.notes)
             for index, (connection, received_ns, data) in enumerate(messages):
                 if stop is not None and index >= stop:
                     return
@@ -117,23 +128,24 @@ def _picture(message: Any, kind: str) -> tuple[npt.NDArray[np.uint8], EncodedPic
     return raw_picture(data, message.height, message.width, message.step, message.encoding), None
 
 
-def _calibration(reader: AnyReader, topic: str) -> CameraModel | None:
-    """The first CameraInfo with the namespace of ``topic``; ROS counts pixel centres as integers,
-    we do not."""
-    base = topic.removesuffix("/compressed").rpartition("/")[0]
+def _calibration(reader: AnyReader, topic: str) -> tuple[CameraModel | None, str]:
+    """Of the first CameraInfo that belongs to ``topic``, and a sentence on it."""
     infos = [connection for connection in reader.connections if connection.msgtype == CAMERA_INFO]
-    siblings = [connection for connection in infos if connection.topic.startswith(base)]
-    for connection, _, data in messages_in(reader, siblings, []):
+    name = info_topic(topic, (connection.topic for connection in infos))
+    if name is None:
+        beside = ", ".join(sorted({each.topic for each in infos}))
+        return None, f"no CameraInfo belongs to {topic}" + (
+            f"; there is {beside}" if beside else ""
+        )
+    fitting = [connection for connection in infos if connection.topic == name]
+    rectified = is_rectified(topic)
+    for connection, _, data in messages_in(reader, fitting, []):
         info = decode(reader, connection, data)
         if info is None:
-            return None
-        fields = {name.lower(): value for name, value in vars(info).items()}
-        model = DISTORTIONS.get(info.distortion_model)
-        k, d = np.asarray(fields["k"], np.float64), tuple(float(v) for v in fields["d"])
-        if k[0] <= 0.0 or (model is None and any(d)):
-            return None
-        return CameraModel(
-            int(info.width), int(info.height), k[0], k[4], k[2] + 0.5, k[5] + 0.5,
-            model or "none", d if model else (),
-        )  # fmt: skip
-    return None
+            break
+        camera = camera_of_info(info, rectified)
+        if isinstance(camera, str):
+            return None, f"{name} is not used: {camera}"
+        what = "P, as its pictures are rectified" if rectified else "K and D"
+        return camera, f"the calibration of {topic} is that of {name}: {what}"
+    return None, f"{name} cannot be read"

@@ -152,8 +152,11 @@ class RecordedTelemetry(TelemetrySource, Protocol):
         ...
 
 
-def open_recording(path: Path, fps: float | None = None) -> RecordedCamera:
-    """Open whatever lies at ``path`` with the first registered source that recognises it.
+def open_recording(
+    path: Path, fps: float | None = None, topic: str | None = None
+) -> RecordedCamera:
+    """Open whatever lies at ``path`` with the first registered source that recognises it; of a
+    recording with several picture topics, ``topic``.
 
     Raises:
         InputError: nothing is there, or no installed source reads it.
@@ -161,6 +164,11 @@ def open_recording(path: Path, fps: float | None = None) -> RecordedCamera:
     if not path.exists():
         raise InputError(f"there is nothing at {path}; give a folder of images or a video file")
     reader = camera_reader(path)
+    if reader is not None and topic is not None:
+        if not hasattr(reader, "topic_of"):
+            raise InputError(f"{path} has no topics; leave out --topic")
+        chosen: RecordedCamera = reader.topic_of(path, topic)  # type: ignore[attr-defined]
+        return chosen
     if reader is not None:
         return reader.open(path, fps=fps)
     names = ", ".join(sorted(entry.name for entry in entry_points(group=CAMERAS)))

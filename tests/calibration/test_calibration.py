@@ -75,8 +75,10 @@ def test_a_result_is_a_camera_file_figures_and_a_picture(
     tmp_path: Path, through_glass: Path
 ) -> None:
     found = calibrate(through_glass, BOARD, "radtan", known=BEHIND_GLASS)
-    camera, figures, plot = write_calibration(found, tmp_path / "new" / "folder")
+    camera, figures, plot, ros, opencv = write_calibration(found, tmp_path / "new" / "folder")
     assert load_camera(camera) == found.fit.camera
+    assert ros.name == "camera_ros.yaml"
+    assert opencv.name == "camera_opencv.yaml"
     numbers = json.loads(figures.read_text())
     assert set(numbers["sigma"]) == {"fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"}
     assert len(numbers["rms_px_of_pictures"]) == numbers["used"] == 12

@@ -139,8 +139,8 @@ def test_repaired_times_are_noted(clip, monkeypatch):
 
 def test_frame_that_cannot_be_decoded_is_dropped():
     class Broken:
-        def retrieve(self):
-            return False, None
+        def at(self, index):
+            return "cannot be decoded"
 
     source = VideoFile.__new__(VideoFile)
     source.path = Path("clip.mp4")
@@ -157,7 +157,9 @@ def test_calibration_beside_the_video_is_used_if_its_shape_fits(clip):
         list(source.frames())
         assert source.notes == [f"the calibration is {calibration}"]
         save_camera(guess_camera(W, W), calibration)
-        assert VideoFile(clip).camera is None
+        misfit = VideoFile(clip)
+        assert misfit.camera is None
+        assert "it was left out" in misfit.notes[0]
     finally:
         calibration.unlink()
     (frame,) = VideoFile(clip).frames(stop=1)

@@ -19,6 +19,8 @@ from aquaflow.base.errors.regular_file import open_regular
 
 MOST_BYTES = 1 << 20
 """The longest config that ships has 4 kB; PyYAML reads some 100 kB a second."""
+DIRECTIVE = "%YAML"
+"""How the YAML of OpenCV's FileStorage begins, in a form that PyYAML refuses."""
 MOST_DEPTH = 32
 """Mappings and lists inside each other; the deepest setting lies in 6."""
 MOST_VALUES = 100_000
@@ -42,7 +44,10 @@ def read_mapping(path: Path, what: str, hint: str, inside: bool = False) -> dict
             data = stream.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise ConfigError(f"{path} is longer than {MOST_BYTES >> 20} MB; {hint}")
-        value = yaml.safe_load(data.decode("utf-8"))
+        text = data.decode("utf-8")
+        if text.startswith(DIRECTIVE):  # its FileStorage writes a head and a tag that YAML has not
+            text = text.partition("\n")[2].replace("!!opencv-matrix", "")
+        value = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the {what} {path}: {reason_of(error)}; {hint}") from error
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:

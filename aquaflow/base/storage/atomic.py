@@ -202,6 +202,15 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         stream.write(text.encode("utf-8"))
 
 
+def _plain(value: Any) -> Any:
+    """NumPy's numbers, which PyYAML refuses, as Python's; tuples as lists."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return value.item() if hasattr(value, "item") and hasattr(value, "dtype") else value
+
+
 def write_yaml(path: Path, data: dict[str, Any], comment: str = "") -> None:
     """Write a YAML file atomically, with its keys in the order of ``data``, after a ``comment`` of
     one line.
@@ -210,6 +219,6 @@ def write_yaml(path: Path, data: dict[str, Any], comment: str = "") -> None:
         InputError: the file cannot be written.
     """
     head = f"# {comment}\n" if comment else ""
-    text = head + yaml.safe_dump(data, sort_keys=False, allow_unicode=False)
+    text = head + yaml.safe_dump(_plain(data), sort_keys=False, allow_unicode=False)
     with atomic_write(path) as stream:
         stream.write(text.encode("utf-8"))
