@@ -92,8 +92,8 @@ def decode_units(
                 decoded, bgr = capture.read()
                 if not decoded or not stream.read_but_not_decoded:
                     break
-                label, refused = stream.read_but_not_decoded.popleft(), decoder.refused()
-                if decoder.errors() or refused:
+                label = stream.read_but_not_decoded.popleft()
+                if decoder.complaints():
                     yield label, None
                     continue
                 yield label, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

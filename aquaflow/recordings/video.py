@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
+import re
 from collections.abc import Iterator
+from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from aquaflow.base.errors import InputError, printable
+from aquaflow.base.errors import printable
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
-from aquaflow.recordings.decoder_log import DecoderLog, FfmpegPictures
 from aquaflow.recordings.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
-from aquaflow.sources import is_asked
+from aquaflow.recordings.picture import UnreadablePictureError
+from aquaflow.recordings.video_decoder import Decoder
+from aquaflow.sources import assumed, is_asked, read_from
 from aquaflow.types import CameraModel, Dropped, Frame
 
-# OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-
-EXTENSIONS = frozenset(
-    {
-        *(".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
-        *(".wmv", ".asf", ".flv", ".3gp", ".vob", ".mxf", ".ogv", ".lrv", ".dv", ".m2v"),
-    }
-)
+EXTENSIONS = frozenset({
+    ".mp4", ".m4v", ".mov", ".3gp", ".insv", ".lrv", ".avi", ".mkv", ".webm", ".ogv", ".wmv",
+    ".asf", ".flv", ".mpg", ".mpeg", ".m2v", ".vob", ".mod", ".ts", ".mts", ".m2ts", ".m2t",
+    ".mxf", ".dv", ".h264", ".264", ".h265", ".hevc", ".mjpeg", ".mjpg",
+})  # fmt: skip
 """Of files in containers that FFmpeg reads and cameras write."""
 
 COUNT_TOLERANCE = 1
 """Some containers give a duration instead of a count; one frame less is not a cut-off video."""
+CHAPTERS = (
+    (re.compile(r"(G[A-Z])01(\d{4})(\.\w+)", re.IGNORECASE), "{0}{chapter:02d}{1}{2}", 2),
+    (re.compile(r"(G)OPR(\d{4})(\.\w+)", re.IGNORECASE), "{0}P{chapter:02d}{1}{2}", 1),
+)
+"""First file of a GoPro recording, the names of its others, and the number of the second one."""
 
 
 class VideoFile:
     """Frames of a video with the times of its container.
 
     Frames that are not asked for are only grabbed: decoded as far as the codec needs, never
-    converted, which makes ``every`` cheap.
+    converted, which makes ``every`` cheap. Pixels that are not square are made so. The first
+    chapter of a GoPro recording brings the others.
     """
 
     specificity = 1
@@ -50,41 +51,18 @@ class VideoFile:
             ConfigError: the ``camera.yaml`` next to it is malformed.
         """
         self.path = path
-        with _open_capture(path) as capture, DecoderLog() as decoder:
-            import cv2
-
-            if not capture.isOpened() or not capture.grab():
-                raise InputError(
-                    f"{path} cannot be read as a video; check that it plays, or give a folder of "
-                    "images"
-                )
-            _, first = capture.retrieve()
-            refused = decoder.refused()
-            count = int(_property(capture, cv2.CAP_PROP_FRAME_COUNT))
-            rate = _property(capture, cv2.CAP_PROP_FPS)
-            aspect = (
-                _property(capture, cv2.CAP_PROP_SAR_NUM), _property(capture, cv2.CAP_PROP_SAR_DEN)
-            )  # fmt: skip
-        self._stored = (first.shape[1], first.shape[0])
-        self.width, self.height = _square(self._stored, *aspect)
-        if refused:  # raises where it cannot be read
-            FfmpegPictures(path, *self._stored).close()
-        self.frame_count: int | None = count if count > 0 else None
+        self.files = _chapters(path)
+        self._read_notes: list[str] = []
+        with Decoder(path) as decoder:
+            self.width, self.height = decoder.width, decoder.height
+            rate, pixel, first = decoder.rate, decoder.pixel_width, decoder.frame_count
+        counts = [first, *(_frame_count(file) for file in self.files[1:])]
+        self.frame_count: int | None = sum(counts) if all(counts) else None
+        self._note_rate(rate, fps)
         known = rate if rate > 0.0 else DEFAULT_FPS
         self._period_ns = NS_PER_S / (known if fps is None else fps)
-        self._facts: list[str] = []
-        if (self.width, self.height) != self._stored:
-            self._facts.append(
-                f"the pixels of {path.name} are not square by its container: pictures of "
-                f"{first.shape[1]} x {first.shape[0]} are read as {self.width} x {self.height}"
-            )
-        if rate <= 0.0 and fps is None:
-            self._facts.append(
-                f"{path.name} states no frame rate: {DEFAULT_FPS:g} pictures a second are assumed "
-                "where it states no times; give --fps"
-            )
-        self.camera = self._sidecar_calibration()
-        self.notes = list(self._facts)
+        self.camera = self._sidecar_calibration(pixel)
+        self.notes: list[str] = list(self._read_notes)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -106,48 +84,29 @@ class VideoFile:
         Seeking is left out on purpose: it is inexact in many containers, and times would differ
         from those of a full pass.
         """
-        self.notes = list(self._facts)
-        with _open_capture(self.path) as capture, DecoderLog() as decoder:
-            clock = _Clock(self._period_ns)
-            pictures = _Pictures(self.path, self._stored, capture, decoder)
-            index = 0
-            try:
+        self.notes = list(self._read_notes)
+        clock, index, begins_ms, doubtful = _Clock(self._period_ns), 0, 0.0, 0
+        for file in self.files:
+            with Decoder(file) as decoder:
+                position_ms = 0.0
                 while stop is None or index < stop:
-                    if not capture.grab():
-                        self._note_early_end(index)
+                    if not decoder.grab():
                         break
-                    t_ns = clock.tick(_position_ms(capture))
+                    position_ms = decoder.position_ms
+                    t_ns = clock.tick(begins_ms + position_ms)
                     if is_asked(index, every, start):
-                        yield self._frame(pictures, index, t_ns)
+                        frame = self._frame(decoder, index, t_ns)
+                        doubtful += isinstance(frame, Dropped)
+                        yield frame
                     index += 1
-            finally:
-                pictures.close()
-                self._note(pictures, clock)
-
-    def close(self) -> None:
-        """Nothing stays open between passes."""
-
-    def _frame(self, pictures: _Pictures, index: int, t_ns: int) -> Frame | Dropped:
-        import cv2
-
-        image = pictures.at(index)
-        if isinstance(image, str):
-            return Dropped(index, t_ns, f"{self.name_of(index)} {image}")
-        if image.shape[:2] == self._stored[::-1] != (self.height, self.width):
-            size = (self.width, self.height)
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-        camera = self.camera or guess_camera(image.shape[1], image.shape[0])
-        return Frame(index, t_ns, t_ns, image, camera)
-
-    def _note(self, pictures: _Pictures, clock: _Clock) -> None:
-        if pictures.damaged:
+                begins_ms += position_ms + self._period_ns * 1e-6
+                self._note_decoding(decoder)
+        if stop is None or index < stop:
+            self._note_early_end(index)
+        if doubtful:
             self.notes.append(
-                f"{pictures.damaged} pictures of {self.path.name} could not be decoded without "
-                f"errors and were left out, the first is {self.name_of(pictures.first_damaged)}"
-            )
-        if pictures.deinterlaced:
-            self.notes.append(
-                f"{self.path.name} has interlaced pictures; they were deinterlaced by FFmpeg"
+                f"{doubtful} frames of {self.path.name} were left out because they cannot be "
+                "decoded without errors"
             )
         if clock.repaired:
             self.notes.append(
@@ -155,78 +114,102 @@ class VideoFile:
                 "set from the frame rate"
             )
 
+    def close(self) -> None:
+        """Nothing stays open between passes."""
+
+    def _frame(self, decoder: Decoder, index: int, t_ns: int) -> Frame | Dropped:
+        import cv2
+
+        try:
+            bgr = decoder.picture()
+        except UnreadablePictureError as error:
+            return Dropped(index, t_ns, f"{self.name_of(index)} {error}")
+        image = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        if image.shape[:2] != (self.height, self.width):
+            image = cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_CUBIC)
+        camera = self.camera or guess_camera(self.width, self.height)
+        return Frame(index, t_ns, t_ns, np.asarray(image, np.uint8), camera)
+
+    def _note_rate(self, rate: float, fps: float | None) -> None:
+        if rate > 0.0:
+            note = read_from("rate", f"{rate:.6g} pictures a second", "the container")
+        elif fps is not None:
+            note = read_from("rate", f"{fps:g} pictures a second", "--fps")
+        else:
+            note = assumed(
+                "rate",
+                f"{DEFAULT_FPS:g} pictures a second",
+                "the container states none; give --fps",
+            )
+        self._read_notes.append(note)
+        if len(self.files) > 1:
+            names = ", ".join(file.name for file in self.files)
+            self._read_notes.append(f"chapters of one recording: {names}")
+
+    def _note_decoding(self, decoder: Decoder) -> None:
+        if decoder.deinterlaced_from is not None:
+            self.notes.append(
+                f"{decoder.path.name} is interlaced from frame {decoder.deinterlaced_from} on; "
+                "FFmpeg decodes and deinterlaces it"
+            )
+        if decoder.complaint:
+            self.notes.append(f"the first error in {decoder.path.name}: {decoder.complaint}")
+
     def _note_early_end(self, read: int) -> None:
         if self.frame_count is not None and read < self.frame_count - COUNT_TOLERANCE:
             self.notes.append(f"the video ends after {read} of {self.frame_count} frames")
 
-    def _sidecar_calibration(self) -> CameraModel | None:
-        """The ``camera.yaml`` in the video's folder, if it is for pictures of this shape, be it
-        with their pixels as they are stored."""
+    def _sidecar_calibration(self, pixel: float) -> CameraModel | None:
+        """The ``camera.yaml`` in the video's folder, if it is for pictures of this shape.
+
+        Sets the size of the pictures: as stored if the calibration is for that, with square pixels
+        otherwise.
+        """
         file = self.path.parent / CALIBRATION
-        if not file.is_file():
+        camera = load_camera(file) if file.is_file() else None
+        if camera is not None and _is_shape_of(camera, self.width, self.height):
+            self._read_notes.append(f"the calibration is {file}")
+            return camera
+        stored = f"{self.width} x {self.height}"
+        if pixel != 1.0:
+            self.width = round(self.width * pixel)
+            what = f"{pixel:.4g} wide and 1 high; pictures of {stored} are stretched to"
+            self._read_notes.append(
+                read_from("pixels", f"{what} {self.width} x {self.height}", "the container")
+            )
+        if camera is None:
             return None
-        camera = load_camera(file)
-        for width, height in ((self.width, self.height), self._stored):
-            aspect = camera.width / camera.height * height / width
-            if abs(aspect - 1.0) <= ASPECT_TOLERANCE:
-                self._facts.append(f"the calibration is {file}")
-                if (width, height) == (self.width, self.height):
-                    return camera
-                return camera.scaled(self.width, self.height)
-        self._facts.append(
-            f"{file} is for pictures of {camera.width} x {camera.height}, these are {self.width} x "
-            f"{self.height}: it was left out"
+        if _is_shape_of(camera, self.width, self.height):
+            self._read_notes.append(f"the calibration is {file}")
+            return camera
+        self._read_notes.append(
+            f"{file} is not used: it is for pictures of {camera.width} x {camera.height}, those of "
+            f"{self.path.name} are {stored}"
         )
         return None
 
 
-class _Pictures:
-    """Grabbed frames as pictures: of OpenCV, or of FFmpeg's program once OpenCV refuses one."""
-
-    def __init__(
-        self, path: Path, size: tuple[int, int], capture: Any, decoder: DecoderLog
-    ) -> None:
-        self._path, self._size, self._capture, self._decoder = path, size, capture, decoder
-        self._ffmpeg: FfmpegPictures | None = None
-        self.damaged, self.first_damaged = 0, 0
-        self.deinterlaced = False
-
-    def at(self, index: int) -> npt.NDArray[np.uint8] | str:
-        """[H, W, 3] RGB of the frame that was grabbed, or why there is none."""
-        import cv2
-
-        if self._decoder.errors():
-            self.first_damaged = self.first_damaged if self.damaged else index
-            self.damaged += 1
-            return "could not be decoded without errors"
-        if self._ffmpeg is None:
-            decoded, bgr = self._capture.retrieve()
-            if not self._decoder.refused():
-                if not decoded:
-                    return "cannot be decoded"
-                return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-            try:
-                self._ffmpeg = FfmpegPictures(self._path, *self._size)
-            except InputError:
-                return "is interlaced, which OpenCV cannot convert; install FFmpeg"
-            self.deinterlaced = True
-        image = self._ffmpeg.at(index)
-        return "cannot be decoded" if image is None else image
-
-    def close(self) -> None:
-        """End FFmpeg's program."""
-        if self._ffmpeg is not None:
-            self._ffmpeg.close()
+def _is_shape_of(camera: CameraModel, width: int, height: int) -> bool:
+    return abs(camera.width / camera.height * height / width - 1.0) <= ASPECT_TOLERANCE
 
 
-def _square(size: tuple[int, int], numerator: float, denominator: float) -> tuple[int, int]:
-    """Width and height with square pixels, none of them lost, for pixels of that shape."""
-    if numerator <= 0.0 or denominator <= 0.0 or numerator == denominator:
-        return size
-    shape = numerator / denominator
-    if shape > 1.0:
-        return round(size[0] * shape), size[1]
-    return size[0], round(size[1] / shape)
+def _chapters(path: Path) -> list[Path]:
+    """The file and, if it is the first chapter of a GoPro recording, the others."""
+    files = [path]
+    for first, form, second in CHAPTERS:
+        match = first.fullmatch(path.name)
+        if match is not None:
+            others = (
+                path.with_name(form.format(*match.groups(), chapter=chapter))
+                for chapter in count(second)
+            )
+            files += takewhile(Path.is_file, others)
+    return files
+
+
+def _frame_count(path: Path) -> int:
+    with Decoder(path) as decoder:
+        return decoder.frame_count
 
 
 class _Clock:
@@ -251,35 +234,3 @@ class _Clock:
             self.repaired += 1
         self._last_ns = t_ns
         return t_ns
-
-
-@contextlib.contextmanager
-def _open_capture(path: Path) -> Iterator[Any]:
-    """A capture on ``path`` that says nothing on stderr: what goes wrong is in the notes."""
-    import cv2
-
-    # Software decoding: hardware decoders differ between machines in the last bit.
-    software = [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE]
-    loud = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG, software)
-    finally:
-        cv2.utils.logging.setLogLevel(loud)
-    try:
-        yield capture
-    finally:
-        capture.release()
-
-
-def _position_ms(capture: Any) -> float:
-    """The grabbed frame's time in its container."""
-    import cv2
-
-    return _property(capture, cv2.CAP_PROP_POS_MSEC)
-
-
-def _property(capture: Any, number: int) -> float:
-    """What a container says of itself; zero, as unknown, where that is not finite."""
-    value = float(capture.get(number))
-    return value if np.isfinite(value) else 0.0

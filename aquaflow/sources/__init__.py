@@ -48,6 +48,16 @@ class CameraSource(Protocol):
     def close(self) -> None: ...
 
 
+def read_from(what: str, value: str, source: str) -> str:
+    """The note of a camera or of telemetry on what it took from the recording itself."""
+    return f"{what}: {value}, from {source}"
+
+
+def assumed(what: str, value: str, because: str) -> str:
+    """The note of a camera or of telemetry on a guess; without one, nothing may be guessed."""
+    return f"{what}: {value} was assumed, because {because}"
+
+
 def is_asked(index: int, every: int, start: int) -> bool:
     """True for the indices ``start, start + every, ...`` of :meth:`CameraSource.frames`."""
     return index >= start and (index - start) % every == 0

@@ -1,0 +1,204 @@
+"""A video through OpenCV, whose word is not believed: it returns pictures that FFmpeg refused."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from typing_extensions import Self
+
+from aquaflow.base.errors import InputError
+from aquaflow.recordings.decoder_log import DecoderLog
+from aquaflow.recordings.picture import UnreadablePictureError
+
+# OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+REFUSED = "Cannot convert interlaced to progressive"
+"""FFmpeg's scaler to OpenCV, which then returns the picture before as this one."""
+REORDERED = 2
+"""Pictures that a codec shows before one that it decoded earlier: H.264 of cameras has 0 to 2."""
+FFMPEG = "ffmpeg"
+DEINTERLACE = "idet=prog_thres=1.05:intl_thres=1.04,bwdif=mode=send_frame:deint=interlaced"
+"""What only says that it is interlaced stays as it is; what is gets one picture a frame.
+
+By idet's usual threshold of 1.5, slow video whose fields are of one moment is undetermined."""
+LEAST_PIXEL, MOST_PIXEL = 0.25, 4.0
+"""Width of a pixel in its heights; anamorphic video has 0.75 to 2, anything beyond is damage."""
+
+
+class Decoder:
+    """Pictures in order, each after :meth:`grab`; silent on stderr.
+
+    A picture that the decoder complained about is none. A codec shows pictures in another order
+    than it decodes, so the ``REORDERED`` pictures after a complaint are none either. Interlaced
+    pictures, which OpenCV cannot convert, come from the program ``ffmpeg``, where it is installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.complaint = ""
+        """The first one."""
+        self.deinterlaced_from: int | None = None
+        """The first picture that OpenCV could not convert."""
+        self._index, self._doubtful_until = -1, -1
+        self._reason = ""
+        self._ffmpeg: subprocess.Popen[bytes] | None = None
+        self._from_ffmpeg = 0
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        """Open the video.
+
+        Raises:
+            InputError: the file is not a video, or no frame of it can be decoded.
+        """
+        import cv2
+
+        self._capture = _open_capture(self.path)
+        self._log = self._stack.enter_context(DecoderLog())
+        try:
+            if not self._capture.isOpened() or not self._capture.grab():
+                raise InputError(
+                    f"{self.path} cannot be read as a video; check that it plays, or give a folder "
+                    "of images"
+                )
+            self.width = int(self._property(cv2.CAP_PROP_FRAME_WIDTH))
+            self.height = int(self._property(cv2.CAP_PROP_FRAME_HEIGHT))
+            self.frame_count = max(0, int(self._property(cv2.CAP_PROP_FRAME_COUNT)))
+            self.rate = self._property(cv2.CAP_PROP_FPS)
+            self.pixel_width = self._pixel_width()
+        except InputError:
+            self.__exit__()
+            raise
+        self._one_thread = False
+        self._pending = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._capture.release()
+        if self._ffmpeg is not None:
+            self._ffmpeg.kill()
+            self._ffmpeg.communicate()
+        self._stack.close()
+
+    @property
+    def position_ms(self) -> float:
+        """The grabbed picture's time in its container."""
+        import cv2
+
+        return self._property(cv2.CAP_PROP_POS_MSEC)
+
+    def grab(self) -> bool:
+        """Decode the next picture; False at the end."""
+        grabbed = self._pending or bool(self._capture.grab())
+        self._pending = False
+        complaints = self._log.complaints()
+        if grabbed and complaints and not self._one_thread:
+            # Threads decode ahead, so that a complaint belongs to a later picture.
+            complaints = self._decode_in_one_thread()
+        self._index += 1
+        if grabbed and complaints:
+            self._doubt(complaints)
+        return grabbed
+
+    def picture(self) -> npt.NDArray[np.uint8]:
+        """The grabbed picture, [height, width, 3] BGR.
+
+        Raises:
+            UnreadablePictureError: it cannot be decoded, or the decoder complained about it.
+        """
+        if self._index <= self._doubtful_until:
+            raise UnreadablePictureError(f"is damaged: {self._reason}")
+        if self.deinterlaced_from is None:
+            decoded, bgr = self._capture.retrieve()
+            complaints = self._log.complaints()
+            if decoded and not complaints:
+                return np.asarray(bgr, np.uint8)
+            if not any(REFUSED in complaint for complaint in complaints):
+                self.complaint = self.complaint or "; ".join(complaints[:1])
+                raise UnreadablePictureError("cannot be decoded")
+            self.deinterlaced_from = self._index
+        return self._read_deinterlaced()
+
+    def _doubt(self, complaints: Sequence[str]) -> None:
+        self._doubtful_until = self._index + REORDERED
+        self._reason = complaints[-1]
+        self.complaint = self.complaint or complaints[0]
+
+    def _decode_in_one_thread(self) -> list[str]:
+        """Open again, and decode up to the picture just grabbed; the complaints about it."""
+        self._capture.release()
+        self._capture = _open_capture(self.path, threads=1)
+        self._one_thread = True
+        for _ in range(self._index + 1):
+            self._capture.grab()
+        self._log.complaints()
+        self._capture.grab()
+        return self._log.complaints()
+
+    def _read_deinterlaced(self) -> npt.NDArray[np.uint8]:
+        if self._ffmpeg is None:
+            program = shutil.which(FFMPEG)
+            if program is None:
+                raise UnreadablePictureError(
+                    "is interlaced, which OpenCV does not decode; install FFmpeg (apt install "
+                    "ffmpeg)"
+                )
+            self._ffmpeg = subprocess.Popen(
+                [
+                    *(program, "-nostdin", "-v", "quiet", "-i", f"file:{self.path.absolute()}"),
+                    *("-map", "0:v:0", "-vf", f"{DEINTERLACE},scale={self.width}:{self.height}"),
+                    *("-fps_mode", "passthrough", "-pix_fmt", "bgr24", "-f", "rawvideo", "-"),
+                ],
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+        assert self._ffmpeg.stdout is not None
+        size, data = self.width * self.height * 3, b""
+        while self._from_ffmpeg <= self._index:
+            data = self._ffmpeg.stdout.read(size)
+            self._from_ffmpeg += 1
+        if len(data) != size:
+            raise UnreadablePictureError("is interlaced, and FFmpeg does not decode it")
+        return np.frombuffer(data, np.uint8).reshape(self.height, self.width, 3)
+
+    def _pixel_width(self) -> float:
+        """Of a pixel, in its heights."""
+        import cv2
+
+        wide, high = (
+            self._property(number) for number in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN)
+        )
+        if wide <= 0.0 or high <= 0.0:
+            return 1.0
+        turned = self._property(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90
+        ratio = high / wide if turned else wide / high
+        return ratio if LEAST_PIXEL <= ratio <= MOST_PIXEL else 1.0
+
+    def _property(self, number: int) -> float:
+        """What a container says of itself; zero, as unknown, where that is not finite."""
+        value = float(self._capture.get(number))
+        return value if np.isfinite(value) else 0.0
+
+
+def _open_capture(path: Path, threads: int | None = None) -> Any:
+    """A capture on ``path``; a relative path with a colon would be a protocol to FFmpeg."""
+    import cv2
+
+    # Software decoding: hardware decoders differ between machines in the last bit.
+    options = [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE]
+    if threads is not None:
+        options += [cv2.CAP_PROP_N_THREADS, threads]
+    loud = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG, options)
+    finally:
+        cv2.utils.logging.setLogLevel(loud)
