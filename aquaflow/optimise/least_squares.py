@@ -73,7 +73,11 @@ class Problem(Protocol[State]):
     def cost(self, state: State) -> float:
         """C; infinite or NaN where ``state`` makes no sense: it is then not taken."""
 
-    def move(self, state: State, step: Array) -> State:
+    def move(
+        self,
+        state: State,
+        step: Array,  # [P]
+    ) -> State:
         """``state`` + step [n], on its manifold."""
 
 
@@ -222,7 +226,10 @@ class RobustFit:
     noise: float = float("nan")
     """1 sigma of a measurement, as last found."""
 
-    def linearise(self, x: Array) -> NormalEquations:
+    def linearise(
+        self,
+        x: Array,  # [P]
+    ) -> NormalEquations:
         """The equations of a step [n]."""
         r = self.residuals(x)
         self.noise = max(sigma_of(r), self.least_noise)
@@ -232,13 +239,20 @@ class RobustFit:
         measured = NormalEquations.of(J, r, self.kernel.weight(size), cost)
         return measured + NormalEquations.expect(x - self.expected, self.sigma)
 
-    def cost(self, x: Array) -> float:
+    def cost(
+        self,
+        x: Array,  # [P]
+    ) -> float:
         """By the noise last found."""
         left = (x - self.expected) / self.sigma
         size = np.abs(self.residuals(x)) / self.noise
         return float(self.kernel.cost(size).sum()) + 0.5 * float(left @ left)
 
-    def move(self, x: Array, step: Array) -> Array:
+    def move(
+        self,
+        x: Array,  # [P]
+        step: Array,  # [P]
+    ) -> Array:
         """x [n] + step [n]."""
         return x + step
 

@@ -32,10 +32,16 @@ TUKEY_95 = 4.685
 class RobustKernel(Protocol):
     """A robust cost of a residual's size, sigmas, and its weight on the square."""
 
-    def cost(self, size: Array) -> Array:
+    def cost(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] rho(s) of sizes [...] >= 0."""
 
-    def weight(self, size: Array) -> Array:
+    def weight(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] rho'(s) / s in [0, 1]."""
 
 
@@ -45,12 +51,18 @@ class Huber:
 
     bound: float = HUBER_95
 
-    def cost(self, size: Array) -> Array:
+    def cost(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] rho(s) of sizes [...] >= 0."""
         near = np.minimum(size, self.bound)
         return np.asarray((size - 0.5 * near) * near)
 
-    def weight(self, size: Array) -> Array:
+    def weight(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] in (0, 1]."""
         return np.asarray(self.bound / np.maximum(size, self.bound))
 
@@ -61,11 +73,17 @@ class Cauchy:
 
     bound: float
 
-    def cost(self, size: Array) -> Array:
+    def cost(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] rho(s) of sizes [...] >= 0."""
         return np.asarray(0.5 * self.bound**2 * np.log1p((size / self.bound) ** 2))
 
-    def weight(self, size: Array) -> Array:
+    def weight(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] in (0, 1]."""
         return np.asarray(1.0 / (1.0 + (size / self.bound) ** 2))
 
@@ -74,11 +92,17 @@ class Cauchy:
 class SoftL1:
     """sqrt(1 + s^2) - 1: a smooth Huber, with no bound to choose."""
 
-    def cost(self, size: Array) -> Array:
+    def cost(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] rho(s) of sizes [...] >= 0."""
         return np.asarray(np.sqrt(1.0 + size**2) - 1.0)
 
-    def weight(self, size: Array) -> Array:
+    def weight(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] in (0, 1]."""
         return np.asarray(1.0 / np.sqrt(1.0 + size**2))
 
@@ -90,12 +114,18 @@ class Tukey:
 
     bound: float = TUKEY_95
 
-    def cost(self, size: Array) -> Array:
+    def cost(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] rho(s) of sizes [...] >= 0."""
         inside = np.clip(1.0 - (size / self.bound) ** 2, 0.0, None)
         return np.asarray(self.bound**2 / 6.0 * (1.0 - inside**3))
 
-    def weight(self, size: Array) -> Array:
+    def weight(
+        self,
+        size: Array,  # [...]
+    ) -> Array:
         """[...] in [0, 1]: 0 from ``bound`` on."""
         return np.asarray(np.clip(1.0 - (size / self.bound) ** 2, 0.0, None) ** 2)
 

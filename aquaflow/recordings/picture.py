@@ -152,7 +152,7 @@ def white_of_16(
 
 
 def to_rgb(
-    picture: npt.NDArray[np.uint8 | np.int32],  # as from read_picture
+    picture: npt.NDArray[np.uint8 | np.int32],  # [H, W] or [H, W, 3]
     white: int,
 ) -> npt.NDArray[np.uint8]:
     """[H, W, 3] uint8 RGB; 16 bits are scaled so that ``white`` becomes 256."""

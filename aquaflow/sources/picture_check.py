@@ -22,7 +22,10 @@ MOST_SHARE = 0.5
 """Share of the pictures from which on something is said of them."""
 
 
-def oddities(pictures: Sequence[npt.NDArray[np.uint8]], step: int = STEP) -> list[str]:
+def oddities(
+    pictures: Sequence[npt.NDArray[np.uint8]],  # [H, W, 3] each
+    step: int = STEP,
+) -> list[str]:
     """Clauses on pictures [H, W, 3] that follow each other; none for usual ones. Every ``step``-th
     pixel is looked at."""
     if not pictures:
@@ -55,7 +58,10 @@ def oddities(pictures: Sequence[npt.NDArray[np.uint8]], step: int = STEP) -> lis
     return said
 
 
-def _correlation(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
+def _correlation(
+    a: npt.NDArray[np.float64],  # [H, W]
+    b: npt.NDArray[np.float64],  # [H, W]
+) -> float:
     if a.std() < FLAT or b.std() < FLAT:
         return 1.0
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])

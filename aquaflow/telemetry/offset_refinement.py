@@ -214,7 +214,11 @@ class _Model:
 class _Turning(RobustFit):
     """With a turn among the numbers, which steps from the left."""
 
-    def move(self, x: Array, step: Array) -> Array:
+    def move(
+        self,
+        x: Array,  # [P]
+        step: Array,  # [P]
+    ) -> Array:
         """x [9] moved by a step [9]."""
         moved = x + step
         turned = Rotation.from_rotvec(step[TURN]) * Rotation.from_rotvec(x[TURN])

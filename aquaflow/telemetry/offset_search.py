@@ -103,8 +103,11 @@ def peaks(camera: RateSeries, body: RateSeries, R_cb: Array | None) -> list[Offs
 
 
 def peak_at(
-    camera: RateSeries, body: RateSeries, R_cb: Array | None, offset_s: float
-) -> OffsetPeak:  # [3, 3]
+    camera: RateSeries,
+    body: RateSeries,
+    R_cb: Array | None,  # [3, 3]
+    offset_s: float,
+) -> OffsetPeak:
     """One offset, however much it explains."""
     explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
     near = int(np.argmin(np.abs(offsets_s - offset_s)))

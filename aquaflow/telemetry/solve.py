@@ -191,7 +191,11 @@ class _Posterior:
         total = float(((at.departure / self._prior) ** 2).sum())
         return 0.5 * (total + sum(float(r @ r) for r in self._residuals(at)))
 
-    def move(self, at: _Estimate, step: Array) -> _Estimate:
+    def move(
+        self,
+        at: _Estimate,
+        step: Array,  # [P]
+    ) -> _Estimate:
         """A step [P], shortened as a whole where it turns too far."""
         step = step * min(1.0, LONGEST_TURN / max(float(np.abs(step[:4]).max()), LONGEST_TURN))
         return _Estimate(at.state.move(step), at.departure + step)

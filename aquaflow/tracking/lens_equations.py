@@ -190,7 +190,11 @@ class SelfCalibration:
         """Robust, the prior of the lens included."""
         return self._weighting.cost(residuals(self._observations, state), state.lens)
 
-    def move(self, state: LensUnknowns, step: Array) -> LensUnknowns:
+    def move(
+        self,
+        state: LensUnknowns,
+        step: Array,  # [P]
+    ) -> LensUnknowns:
         """Poses, depths and lens after a step [C] from where they were linearised last."""
         assert self._equations is not None
         return self._equations.move(step)

@@ -91,7 +91,7 @@ def keypoints_of_the_lens(
         shown.append(finder.shown)
         return masked
 
-    find = OverlayFinder.masked
+    find = OverlayFinder.mask
     monkeypatch.setattr(OverlayFinder, "mask", keep)
     monkeypatch.setattr(calibration_pass, "found_lens", spy)
     recording = open_recording(pool / "images")

@@ -43,7 +43,7 @@ class PatchDescriber:
         flat = patches.reshape(*patches.shape[:2], -1)
         return unit(flat - flat.mean(-1, keepdims=True)).astype(np.float16)
 
-    def compared(
+    def compare(
         self,
         a: npt.NDArray[np.float16],
         b: npt.NDArray[np.float16],

@@ -32,7 +32,7 @@ def half_a_minute_at_one_place(check: Check, seed: int) -> None:
     _hover(check, OnePlace(seed, SMALL), MINUTE)
 
 
-@case("soak", "tracking.returning.Returning.due", long=True)
+@case("soak", "tracking.keyframe_reuse.KeyframeReuse.due", long=True)
 def two_hours_at_one_place(check: Check, seed: int) -> None:
     """72,000 frames, 360 times away and back; half an hour of a core."""
     half, end = _hover(check, OnePlace(seed), TWO_HOURS)

@@ -68,7 +68,12 @@ def descend(
 class JointAdjustment:
     """Matches and links; F poses are free."""
 
-    def __init__(self, matches: Sequence[AnchorMatches], links: Links, free: Mask) -> None:
+    def __init__(
+        self,
+        matches: Sequence[AnchorMatches],
+        links: Links,
+        free: Mask,  # [K]
+    ) -> None:
         self._matches, self._links, self._free = matches, links, free
         self._pattern = BlockPattern.of(matches, links, free)
         self._system: System | None = None
@@ -89,7 +94,11 @@ class JointAdjustment:
         self._system = replace(system, cost=self.cost(state))
         return self._system
 
-    def move(self, state: BundleState, step: Array) -> BundleState:
+    def move(
+        self,
+        state: BundleState,
+        step: Array,  # [P]
+    ) -> BundleState:
         """Poses moved by a step [7 F], and the depths that fit best then, to first order."""
         assert self._system is not None
         whole = np.zeros((len(state.poses), 7))

@@ -142,6 +142,10 @@ class _Placement:
         """Huber's, of all links."""
         return float(KERNEL.cost(self.sizes(self.residuals(T_sm))).sum())
 
-    def move(self, T_sm: Sim3Batch, step: Array) -> Sim3Batch:
+    def move(
+        self,
+        T_sm: Sim3Batch,
+        step: Array,  # [P]
+    ) -> Sim3Batch:
         """T_sm [1] after a step [7]."""
         return (Sim3Batch.exp(step[None]) @ T_sm).on_group()

@@ -209,7 +209,11 @@ class _System:
     def linearise(self, bundle: Bundle) -> _Equations:
         return _Equations(*self._blocks(bundle), self.cost(bundle))
 
-    def move(self, bundle: Bundle, step: Array) -> Bundle:
+    def move(
+        self,
+        bundle: Bundle,
+        step: Array,  # [P]
+    ) -> Bundle:
         dc, dp = np.split(step, [len(step) - len(bundle.rho)])
         views = []
         for v, T in enumerate(bundle.T):

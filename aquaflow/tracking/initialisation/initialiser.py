@@ -172,7 +172,7 @@ class Initialiser:
         trusted = result is not None and self._trustworthy(explained, result)
         little = self.parallax_px < self._enough_px
         if little:
-            trusted = trusted and result is not None and self._decided(hypotheses, result)
+            trusted = trusted and result is not None and self._is_decided(hypotheses, result)
         self.contradicted = little and explained < self._config.min_explained
         self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
         if result is None or not trusted:
@@ -200,7 +200,7 @@ class Initialiser:
             and focal_known
         )
 
-    def _decided(self, hypotheses: Hypotheses, result: BundleResult) -> bool:
+    def _is_decided(self, hypotheses: Hypotheses, result: BundleResult) -> bool:
         """True if depths and direction are known, however little parallax there is: at the noise
         that matches are known to have, not that of the few that are left, and without a rival."""
         worse = max(self._config.sigma_px / result.residual_px, 1.0)

@@ -103,7 +103,11 @@ class _PoseDescent:
         """Of the weighted, whitened Huber loss."""
         return self.linearise(T).cost
 
-    def move(self, T: Sim3, step: Array) -> Sim3:
+    def move(
+        self,
+        T: Sim3,
+        step: Array,  # [P]
+    ) -> Sim3:
         """First-order retraction of the left tangent."""
         R = so3_exp(step[3:6])
         growth = float(np.exp(step[6])) if len(step) == 7 else 1.0

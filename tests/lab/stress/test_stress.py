@@ -101,7 +101,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("picture_through_bare_map", [(water, "MIN_SOLID", 0.0)]),
     ("depth_loss_at_range_0", [(view_loss, "MIN_RANGE", 0.0)]),
     ("rank_deficient", [(NormalEquations, "solve", unguarded_step)]),
-    ("nan_matches_in_bundle", [(bundle, "measured", everything)]),
+    ("nan_matches_in_bundle", [(bundle, "is_measured", everything)]),
     ("points_behind_the_camera", [(triangulation, "MIN_DEPTH", -INFINITY)]),
     ("parallel_rays", [(triangulation, "MIN_PARALLAX_RAD", -1.0)]),
     ("projection_at_depth_0", [(camera, "MIN_DEPTH", -INFINITY)]),
@@ -121,12 +121,13 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
         "pure_rotation",
         [
             (initialiser.Initialiser, "_trustworthy", always),
+            (initialiser.Initialiser, "_is_decided", always),
             (triangulation, "MIN_PARALLAX_RAD", -1.0),
         ],
     ),
     pytest.param(
         "snow",
-        [(current_keyframe.KeyframeTracker, "hidden", lambda *_: False)],
+        [(current_keyframe.KeyframeTracker, "is_hidden", lambda *_: False)],
         marks=pytest.mark.slow,
     ),
 ]

@@ -56,7 +56,7 @@ def test_poses_and_camera_say_where_a_place_is_seen_again(
     survey: SurveyPictures, apart: int
 ) -> None:
     first, second = 40, 40 + apart
-    x, y, ahead, _ = survey._met(survey.T_wc(first))
+    x, y, ahead, _ = survey._intersect_seabed(survey.T_wc(first))
     rays = survey.camera.unproject(survey.camera.pixel_centres())
     places = survey.T_wc(first).apply(rays * ahead[..., None])
     assert np.abs(places[..., 0] - x).max() < 0.01
@@ -71,7 +71,7 @@ def test_poses_and_camera_say_where_a_place_is_seen_again(
 
 
 def test_rays_end_on_the_relief(survey: SurveyPictures) -> None:
-    x, y, ahead, box = survey._met(survey.T_wc(70))
+    x, y, ahead, box = survey._intersect_seabed(survey.T_wc(70))
     assert box[0] <= x.min() <= x.max() <= box[2]
     assert box[1] <= y.min() <= y.max() <= box[3]
     assert 0.8 * ALTITUDE_M < ahead.min() < ahead.max() < 1.3 * ALTITUDE_M

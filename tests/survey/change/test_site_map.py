@@ -130,7 +130,7 @@ def test_dives_over_different_ground_keep_all_and_their_own_colours(tmp_path: Pa
     elsewhere = [far_away @ pose for pose in above_plane()]
     monday = DayMap("monday", gaussians(None), sharp_views(None, tmp_path))
     tuesday = DayMap(
-        "tuesday", gaussians(None, (2, 2, 2)).transformed(far_away),
+        "tuesday", gaussians(None, (2, 2, 2)).transform(far_away),
         surfaces_of(elsewhere, [to_plane] * 5, tmp_path, SHARP),
     )  # fmt: skip
     for part in combine([monday, tuesday]):

@@ -81,7 +81,7 @@ def write_small_dive(folder: Path, frame: WorldFrame | None = None) -> Mapper:
         write_metric_file(folder, {0: frame}, main=0)
     T_nm = (frame or WorldFrame.unknown()).T_nm
     for name, share in (("map_clear", 1.0), ("map", 0.5)):
-        write_ply(folder / f"{name}.ply", _splats(mapper, share).transformed(T_nm))
+        write_ply(folder / f"{name}.ply", _splats(mapper, share).transform(T_nm))
     return mapper
 
 

@@ -135,14 +135,14 @@ def test_calm_conditions_change_and_draw_nothing(clear: Pair) -> None:
 
 
 def test_conditions_are_scaled_together() -> None:
-    half = Conditions().scaled(0.5)
+    half = Conditions().scale(0.5)
     for field in fields(Conditions):
         assert getattr(half, field.name) == pytest.approx(0.5 * getattr(Conditions(), field.name))
 
 
 def test_every_condition_at_once_gives_pictures_and_matches(clear: Pair) -> None:
     looks = WindowVariation(width=48, height=32)
-    pair = training_pair(Draw(12), clear, looks, Conditions().scaled(10.0))
+    pair = training_pair(Draw(12), clear, looks, Conditions().scale(10.0))
     for view in (pair.a, pair.b):
         assert bool(torch.isfinite(view.image).all())
         assert float(view.image.min()) >= 0.0
