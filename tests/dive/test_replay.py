@@ -135,7 +135,7 @@ def test_a_still_camera_gives_no_map_and_says_what_is_needed(
     source.mkdir()
     for i in range(8):
         shutil.copy(small_recording / "images" / "000000.png", source / f"{i}.png")
-    with pytest.raises(NotMappedError, match="move sideways"):
+    with pytest.raises(NotMappedError, match="nothing moves"):
         map_recording(open_recording(source), "still", tmp_path / "dive", TRACKING_ONLY)
     assert all(row["reason"] for row in rows(tmp_path / "dive"))
     with pytest.raises(InputError, match="is not finished: mapping it was cut off, or failed"):
