@@ -30,7 +30,7 @@ def survey(
     before: dict[str, Before] = {}
     for dive in dives:
         folder = work / dive.name.replace(" ", "_")
-        ended, found = harness.count(dive, recordings, folder)
+        ended, found = harness.counted(dive, recordings, folder)
         assert ended.code == 0, f"{dive.name} fails without a fault: {ended.err}"
         before[dive.name] = verdict.frames_of(folder / "dive", whole=dive.command == "map")
         for site, what in found.items():

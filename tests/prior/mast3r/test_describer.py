@@ -75,7 +75,7 @@ def test_each_way_is_decoded_once(
     describer: Mast3rDescriber, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    decoded = describer.decoded
+    decoded = describer.decode
     monkeypatch.setattr(describer, "decode", lambda *ab: asked.append(1) or decoded(*ab))
     pair = compared(describer)
     for _ in range(2):
