@@ -141,3 +141,11 @@ def test_files_for_ros_and_opencv_hold_the_same_camera(
     assert load_camera(opencv) == camera
     storage = cv2.FileStorage(str(opencv), cv2.FILE_STORAGE_READ)
     assert storage.getNode("camera_matrix").mat()[0, 2] == 321.0
+
+
+def test_entities_that_grow_without_end_are_refused(tmp_path: Path) -> None:
+    grow = "".join(f"<!ENTITY e{k + 1} '{f'&e{k};' * 10}'>" for k in range(9))
+    bomb = f"<!DOCTYPE c [<!ENTITY e0 '{'x' * 100}'>{grow}]><calibration>&e9;</calibration>"
+    (tmp_path / "m.xml").write_text(bomb)
+    with pytest.raises(ConfigError, match="Metashape"):
+        load_camera(tmp_path / "m.xml")
