@@ -265,7 +265,8 @@ class McapCamera:
             data = bytes(fields.data)
             return compressed_picture(data), received_as(data)
         shape = (fields.height, fields.width, fields.step)
-        return raw_picture(bytes(fields.data), *shape, fields.encoding), None
+        big_endian = bool(getattr(fields, "is_bigendian", False))  # of ROS; foxglove's never are
+        return raw_picture(bytes(fields.data), *shape, fields.encoding, big_endian), None
 
     def _video(self) -> Iterator[Frame | Dropped]:
         gone: list[Dropped] = []

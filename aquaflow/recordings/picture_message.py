@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,17 +14,18 @@ from aquaflow.recordings.picture import (
     white_of_16,
 )
 
-CHANNELS = {
-    "rgb8": 3, "8uc3": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8uc1": 1,
-}  # fmt: skip
-"""Bytes a pixel of the encodings with one byte a channel (sensor_msgs/image_encodings.h)."""
-
-GREY_16 = frozenset({"mono16", "16uc1"})
-"""Names of 16-bit grey, in small letters."""
-BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
+PACKED = re.compile(r"(mono|rgba|rgb|bgra|bgr)(8|16)|(8|16)uc([134])")
+"""Channels beside each other, 8 or 16 bits each (sensor_msgs/image_encodings.h); those named by
+types of OpenCV have its order, blue first."""
+BAYER = re.compile(r"bayer_(rggb|bggr|gbrg|grbg)(8|16)")
+SECOND_ROW = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 """OpenCV names a pattern by its second row."""
-YUYV = frozenset({"yuv422_yuy2", "yuyv"})
-"""Names of 4:2:2 pictures that begin with luma."""
+PAIRS = {
+    "yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2",
+}  # fmt: skip
+"""4:2:2, two bytes a pixel: colour first in ``yuv422``, as ROS has it, luma first in YUY2."""
+PLANES = {"nv12": "NV12", "nv21": "NV21"}
+"""4:2:0: luma, then half as many rows of colour."""
 
 
 def compressed_picture(data: bytes) -> npt.NDArray[np.uint8]:
@@ -36,44 +39,92 @@ def compressed_picture(data: bytes) -> npt.NDArray[np.uint8]:
 
 
 def raw_picture(
-    data: bytes, height: int, width: int, step: int, encoding: str
+    data: bytes, height: int, width: int, step: int, encoding: str, big_endian: bool = False
 ) -> npt.NDArray[np.uint8]:
     """The pixels of a foxglove.RawImage or a sensor_msgs/Image as [H, W, 3] RGB.
+
+    ``step`` is the length of a row in bytes; ``big_endian`` the order of 16-bit numbers.
 
     Raises:
         UnreadablePictureError: the encoding is not known, or data are missing.
     """
     name = encoding.lower()
+    packed, bayer = PACKED.fullmatch(name), BAYER.fullmatch(name)
+    if packed is None and bayer is None and name not in {*PAIRS, *PLANES}:
+        raise UnreadablePictureError(f"has pixels of encoding '{encoding}'")
     try:
-        rows = np.frombuffer(data, np.uint8)[: height * step].reshape(height, step)
-        if name in GREY_16:
-            grey = rows[:, : 2 * width].copy().view("<u2").astype(np.int32)
-            return to_rgb(grey, white_of_16(grey))
-        if name in BAYER or name in YUYV:
-            return _convert(rows, height, width, name)
-        channels = CHANNELS[name]
-        picture = rows[:, : channels * width].reshape(height, width, channels)
-    except KeyError:
-        raise UnreadablePictureError(f"has pixels of encoding '{encoding}'") from None
+        if name in PLANES:
+            return _from_yuv(_rows(data, height * 3 // 2, step)[:, :width], PLANES[name])
+        rows = _rows(data, height, step)
+        if name in PAIRS:
+            return _from_yuv(rows[:, : 2 * width].reshape(height, width, 2), PAIRS[name])
+        if bayer is not None:
+            pattern = _numbers(rows, width, int(bayer[2]), big_endian)
+            return _in_eight_bits(_from_bayer(pattern, SECOND_ROW[bayer[1]]))
+        assert packed is not None
+        return _from_packed(rows, width, packed, big_endian)
     except ValueError:
         raise UnreadablePictureError("holds fewer pixels than it says") from None
-    if channels == 1:
-        return np.repeat(picture, 3, axis=2)
-    ordered = picture[..., 2::-1] if name.startswith("bgr") else picture[..., :3]
-    return np.ascontiguousarray(ordered)
 
 
-def _convert(
+def _rows(data: bytes, height: int, step: int) -> npt.NDArray[np.uint8]:
+    return np.frombuffer(data, np.uint8)[: height * step].reshape(height, step)
+
+
+def _from_packed(
     rows: npt.NDArray[np.uint8],  # [H, step]
-    height: int,
     width: int,
-    name: str,
+    name: re.Match[str],
+    big_endian: bool,
+) -> npt.NDArray[np.uint8]:
+    """[H, W, 3] of what ``PACKED`` matches."""
+    order = name[1] or {"1": "mono", "3": "bgr", "4": "bgra"}[name[4]]
+    channels = {"mono": 1, "rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4}[order]
+    numbers = _numbers(rows, width * channels, int(name[2] or name[3]), big_endian)
+    picture = numbers.reshape(len(rows), width, channels)
+    if channels == 1:
+        return _in_eight_bits(picture[..., 0])
+    return _in_eight_bits(picture[..., 2::-1] if order.startswith("bgr") else picture[..., :3])
+
+
+def _numbers(
+    rows: npt.NDArray[np.uint8],  # [H, step]
+    count: int,
+    bits: int,
+    big_endian: bool,
+) -> npt.NDArray[np.uint8 | np.uint16]:
+    """[H, count] of each row."""
+    if bits == 8:
+        return rows[:, :count]
+    stored = rows[:, : 2 * count].copy().view(">u2" if big_endian else "<u2")
+    return stored.astype(np.uint16)
+
+
+def _in_eight_bits(
+    picture: npt.NDArray[np.uint8 | np.uint16],  # [H, W] or [H, W, 3]
+) -> npt.NDArray[np.uint8]:
+    """[H, W, 3]"""
+    if picture.dtype == np.uint8:
+        return to_rgb(picture.astype(np.uint8), 1)
+    wide = picture.astype(np.int32)
+    return to_rgb(wide, white_of_16(wide))
+
+
+def _from_bayer(
+    pattern: npt.NDArray[np.uint8 | np.uint16],  # [H, W]
+    second_row: str,
+) -> npt.NDArray[np.uint8 | np.uint16]:
+    import cv2
+
+    code = getattr(cv2, f"COLOR_Bayer{second_row}2RGB")
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pattern), code), pattern.dtype)
+
+
+def _from_yuv(
+    pixels: npt.NDArray[np.uint8],  # [H, W, 2], or [H * 3 / 2, W] of planes
+    layout: str,
 ) -> npt.NDArray[np.uint8]:
     import cv2
 
-    if name in YUYV:
-        pixels = np.ascontiguousarray(rows[:, : 2 * width]).reshape(height, width, 2)
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_YUY2), np.uint8)
-    pattern = np.ascontiguousarray(rows[:, :width])
-    code = getattr(cv2, f"COLOR_Bayer{BAYER[name]}2RGB")
-    return np.asarray(cv2.cvtColor(pattern, code), np.uint8)
+    code = getattr(cv2, f"COLOR_YUV2RGB_{layout}")
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), code), np.uint8)

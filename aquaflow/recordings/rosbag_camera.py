@@ -125,7 +125,8 @@ def _picture(message: Any, kind: str) -> tuple[npt.NDArray[np.uint8], EncodedPic
     data = bytes(message.data)
     if kind == COMPRESSED:
         return compressed_picture(data), received_as(data)
-    return raw_picture(data, message.height, message.width, message.step, message.encoding), None
+    shape = (message.height, message.width, message.step)
+    return raw_picture(data, *shape, message.encoding, bool(message.is_bigendian)), None
 
 
 def _calibration(reader: AnyReader, topic: str) -> tuple[CameraModel | None, str]:
