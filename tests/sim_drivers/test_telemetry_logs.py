@@ -280,7 +280,8 @@ def test_a_manifest_states_how_its_camera_is_mounted(pictures: Path) -> None:
     assert mounting_of(recording) == MountingConfig(pitch_deg=-90.0)
     assert (recording.frame_count, recording.name_of(1)) == (3, "1.png")
     assert [frame.index for frame in recording.frames(every=2)] == [0, 2]
-    assert recording.notes == []
+    [note] = recording.notes
+    assert note.startswith("the times of the pictures are not known")
 
 
 def test_a_logs_bytes_can_be_tapped_as_a_live_links(dive: Path) -> None:
