@@ -187,6 +187,16 @@ def test_no_folder_imports_itself_by_way_of_its_neighbours() -> None:
     assert {folder: found for folder in folders if (found := cycle(folded(graph, folder)))} == {}
 
 
+def test_a_program_begins_below_everything_that_it_calls() -> None:
+    early = [
+        ".".join(module)
+        for module, path in FILES.items()
+        for statement in ast.parse(path.read_text()).body[:-1]
+        if isinstance(statement, ast.If) and "__name__" in ast.unparse(statement.test)
+    ]
+    assert early == []
+
+
 def test_every_folder_stands_on_one_of_four_floors() -> None:
     families = {family(module) for module in graph_of_files()}
     assert families == {name for floor in FLOORS for name in floor}

@@ -150,7 +150,7 @@ def test_wheel_holds_every_variant_and_is_installed_without_a_compiler(tmp_path:
     assert re.fullmatch(rf"manylinux_2_\d+_{os.uname().machine}", platform)
     assert platform == audited_platform(wheel)
     assert libraries(wheel) == {f"libaquaflow_{isa}.so" for isa in native.target_isas(compiler)}
-    page = ROOT / "aquaflow" / "service" / "health" / "page"
+    page = ROOT / "aquaflow" / "live" / "health" / "page"
     assert page_files(wheel) == {file.name for file in page.iterdir() if file.suffix in PAGE}
     renderer, path = renderer_of(wheel, tmp_path)
     assert renderer == "cpu 0"

@@ -58,10 +58,6 @@ def perform(job: BenchJob) -> dict[str, Any]:
     return {**metrics, **measure_errors(scene, out), "peak_rss_mb": peak_mb}
 
 
-if __name__ == "__main__":
-    answer(BenchJob.from_text, perform)
-
-
 # --------------------------------------------------------------------------------------------------
 # The errors of one finished run: what ``aquaflow lab evaluate`` says, and the depth of its map.
 
@@ -135,3 +131,7 @@ def _like(
     rows = (np.arange(shape[0]) + 0.5) * values.shape[0] / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * values.shape[1] / shape[1]
     return np.asarray(values[np.ix_(rows.astype(int), columns.astype(int))])
+
+
+if __name__ == "__main__":
+    answer(BenchJob.from_text, perform)

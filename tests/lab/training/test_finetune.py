@@ -169,7 +169,7 @@ finetune.plan_of = lambda batches, settings: TrainingPlan(
 torch.manual_seed(0)
 network = Mast3r(TINY)
 with joined_processes() as process:
-    pairs = finetune.mined(
+    pairs = finetune.mine_pairs(
         finetune.read_data([f"tartanair={data}"]), out, settings, process, lambda *_: None
     )
     finetune.fine_tune(network, pairs, out, settings, process, lambda *_: None)

@@ -87,10 +87,6 @@ def _finish_run(run: DiveRun) -> dict[str, Any]:
     }
 
 
-if __name__ == "__main__":
-    answer(GrowthJob.from_text, perform)
-
-
 # --------------------------------------------------------------------------------------------------
 # How long a browser waits for a finished dive: from the command to the page and to the map.
 
@@ -224,3 +220,7 @@ class TenthsMeter:
             "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
             "resident_mb": resident_mb(),
         }
+
+
+if __name__ == "__main__":
+    answer(GrowthJob.from_text, perform)
