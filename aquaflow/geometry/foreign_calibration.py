@@ -53,7 +53,7 @@ def values_of_file(path: Path) -> Values | None:
         text = path.read_bytes()[: MOST_BYTES + 1].decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the calibration {path}: {reason_of(error)}") from error
-    return _named(path, reader, text)
+    return _read(path, reader, text)
 
 
 def values_of_yaml(path: Path, data: Values) -> Values | None:
@@ -64,15 +64,15 @@ def values_of_yaml(path: Path, data: Values) -> Values | None:
     """
     cameras = [each for name, each in data.items() if re.fullmatch(r"cam\d+", name)]
     if cameras:
-        return _named(path, _kalibr, cameras)
+        return _read(path, _kalibr, cameras)
     if "camera_matrix" in data and "image_width" in data and "distortion_model" in data:
-        return _named(path, _ros, data)
+        return _read(path, _ros, data)
     if {"camera_matrix", "cameraMatrix", "Camera_Matrix", "K"} & set(data):
-        return _named(path, _opencv, data)
+        return _read(path, _opencv, data)
     return None
 
 
-def _named(path: Path, reader: Any, content: Any) -> Values:
+def _read(path: Path, reader: Any, content: Any) -> Values:
     name = {
         _xml: "Metashape or OpenCV", _odm: "OpenDroneMap", _colmap: "COLMAP", _kalibr: "Kalibr",
         _ros: "ROS", _opencv: "OpenCV",

@@ -26,7 +26,7 @@ NOT_SCENES = ("depth", "disparity", "mask", "segment", "confidence", "infra", "t
 """Parts of the names of topics whose pictures are not what a colour camera saw."""
 
 
-def preferred(topics: Iterable[tuple[str, int]]) -> str | None:
+def choose_topic(topics: Iterable[tuple[str, int]]) -> str | None:
     """Of picture topics with their counts, the one to map: pictures of the scene before depth,
     the one with the most messages, the first by name."""
     ranked = sorted(

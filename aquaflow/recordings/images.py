@@ -6,7 +6,7 @@ import contextlib
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime, timezone
 from itertools import pairwise
 from pathlib import Path
@@ -256,10 +256,10 @@ def _times_ns(stamps: Path | None, files: list[Path], fps: float | None) -> tupl
         if not (np.isfinite(fps) and fps > 0.0):
             raise InputError(f"a frame rate of {fps:g} pictures a second is not above zero")
         return _evenly(len(files), fps), f"the pictures have the {fps:g} a second that were given"
-    if (named := _increasing([time_of_name(file.stem) for file in files])) is not None:
+    if (named := _increasing(time_of_name(file.stem) for file in files)) is not None:
         kind, times = named
         return times, f"the times of the pictures are the {kind} in their names"
-    if (taken := _increasing([_exif_time(file) for file in files])) is not None:
+    if (taken := _increasing(_exif_time(file) for file in files)) is not None:
         return taken[1], "the times of the pictures are those of their EXIF"
     return _evenly(len(files), DEFAULT_FPS), (
         f"the times of the pictures are not known: {DEFAULT_FPS:g} a second are assumed; give "
@@ -271,10 +271,15 @@ def _evenly(count: int, rate: float) -> list[int]:
     return [round(index * NS_PER_S / rate) for index in range(count)]
 
 
-def _increasing(times: list[tuple[str, int] | None]) -> tuple[str, list[int]] | None:
-    """Kind and ns since the first, if all are of one kind and none is twice or earlier."""
-    known = [time for time in times if time is not None]
-    if len(known) < max(2, len(times)) or len({kind for kind, _ in known}) > 1:
+def _increasing(times: Iterable[tuple[str, int] | None]) -> tuple[str, list[int]] | None:
+    """Kind and ns since the first, if all are of one kind and none is twice or earlier; none is
+    looked for after one that is missing."""
+    known = []
+    for time in times:
+        if time is None:
+            return None
+        known.append(time)
+    if len(known) < 2 or len({kind for kind, _ in known}) > 1:
         return None
     ns = [time for _, time in known]
     if any(after <= before for before, after in pairwise(ns)):

@@ -23,7 +23,7 @@ from aquaflow.geometry.camera import (
     guess_camera,
     has_unmeasured_port,
 )
-from aquaflow.recordings.camera_info import camera_of_info, info_topic, is_rectified, preferred
+from aquaflow.recordings.camera_info import camera_of_info, choose_topic, info_topic, is_rectified
 from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
 from aquaflow.recordings.picture import UnreadablePictureError, received_as
@@ -79,7 +79,7 @@ class McapCamera:
         self._messages = McapMessages(mcap_files(path))
         self._payloads = Payloads()
         if camera is None and topic is None:
-            topic = self._preferred()
+            topic = self._choose_topic()
         first, self.origin_ns = self._first_picture(camera, topic)
         self.topic = first.topic
         self._base = first.topic.rpartition("/")[0]
@@ -148,14 +148,18 @@ class McapCamera:
                 f"the mounting of the camera in {self.path.name} is damaged; give fusion.camera"
             ) from None
 
-    def _preferred(self) -> str | None:
+    def _choose_topic(self) -> str | None:
         """The picture topic that suits best, where there are several and none is ours."""
-        heads = list(self._messages.heads())
+        heads = []
+        for each in self._messages.heads():
+            if OURS in self._messages.facts:
+                return None
+            heads.append(each)
         found = [each.topic for each in heads if picture_kind(each) is not None]
-        if OURS in self._messages.facts or len(found) < 2:
+        if len(found) < 2:
             return None
         counts = self._messages.counts() or Counter(each.topic for each in heads)
-        return preferred((topic, counts.get(topic, 0)) for topic in found)
+        return choose_topic((topic, counts.get(topic, 0)) for topic in found)
 
     def _first_picture(self, camera: str | None, topic: str | None) -> tuple[McapMessage, int]:
         """The first picture, and when it or a missing one before it was taken."""

@@ -79,12 +79,15 @@ class McapMessages:
                 self.notes.append(f"{file.name} cannot be read: {error.strerror}")
 
     def heads(self) -> Iterator[McapMessage]:
-        """The first message of every topic, as far as ``HEAD`` messages reach."""
-        seen: set[str] = set()
+        """The first message of every topic, as far as ``HEAD`` messages reach; no message is read
+        after those of all topics that the summary names."""
+        left, seen = set(self.counts() or ()), set[str]()
         for _, message in zip(range(HEAD), self, strict=False):
             if message.topic not in seen:
                 seen.add(message.topic)
                 yield message
+                if left and left <= seen:
+                    return
 
     def counts(self) -> dict[str, int] | None:
         """Messages by topic from the files' summaries; None if one was cut off before it."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.recordings.camera_info import preferred
+from aquaflow.recordings.camera_info import choose_topic
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -94,7 +94,7 @@ def picture_topics(reader: AnyReader) -> dict[str, int]:
 
 def picture_connections(reader: AnyReader, topic: str | None = None) -> list[Connection]:
     """Those of a picture topic; None: of the one that suits best."""
-    chosen = topic or preferred(picture_topics(reader).items())
+    chosen = topic or choose_topic(picture_topics(reader).items())
     return [c for c in reader.connections if c.msgtype in PICTURES and c.topic == chosen]
 
 

@@ -14,9 +14,9 @@ from aquaflow.geometry.camera import CameraModel, guess_camera
 from aquaflow.recordings.camera_info import (
     CAMERA_INFO,
     camera_of_info,
+    choose_topic,
     info_topic,
     is_rectified,
-    preferred,
 )
 from aquaflow.recordings.picture import UnreadablePictureError, received_as
 from aquaflow.recordings.picture_message import compressed_picture, raw_picture
@@ -63,7 +63,7 @@ class RosbagCamera:
                     f"the bag {path} has no pictures on {topic}; there are: "
                     f"{', '.join(sorted(counts))}"
                 )
-            self.topic = topic or preferred(counts.items()) or ""
+            self.topic = topic or choose_topic(counts.items()) or ""
             self.frame_count: int | None = counts[self.topic]
             self.origin_ns = origin_of(reader, self.topic)
             self.camera, said = _calibration(reader, self.topic)

@@ -13,8 +13,8 @@ from aquaflow.base.errors import printable
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
 from aquaflow.recordings.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 from aquaflow.recordings.picture import UnreadablePictureError
-from aquaflow.recordings.video_decoder import Decoder
-from aquaflow.sources import assumed, is_asked, read_from
+from aquaflow.recordings.video_decoder import VideoDecoder
+from aquaflow.sources import is_asked
 from aquaflow.types import CameraModel, Dropped, Frame
 
 EXTENSIONS = frozenset({
@@ -53,7 +53,7 @@ class VideoFile:
         self.path = path
         self.files = _chapters(path)
         self._read_notes: list[str] = []
-        with Decoder(path) as decoder:
+        with VideoDecoder(path) as decoder:
             self.width, self.height = decoder.width, decoder.height
             rate, pixel, first = decoder.rate, decoder.pixel_width, decoder.frame_count
         counts = [first, *(_frame_count(file) for file in self.files[1:])]
@@ -87,7 +87,7 @@ class VideoFile:
         self.notes = list(self._read_notes)
         clock, index, begins_ms, doubtful = _Clock(self._period_ns), 0, 0.0, 0
         for file in self.files:
-            with Decoder(file) as decoder:
+            with VideoDecoder(file) as decoder:
                 position_ms = 0.0
                 while stop is None or index < stop:
                     if not decoder.grab():
@@ -117,7 +117,7 @@ class VideoFile:
     def close(self) -> None:
         """Nothing stays open between passes."""
 
-    def _frame(self, decoder: Decoder, index: int, t_ns: int) -> Frame | Dropped:
+    def _frame(self, decoder: VideoDecoder, index: int, t_ns: int) -> Frame | Dropped:
         import cv2
 
         try:
@@ -132,21 +132,20 @@ class VideoFile:
 
     def _note_rate(self, rate: float, fps: float | None) -> None:
         if rate > 0.0:
-            note = read_from("rate", f"{rate:.6g} pictures a second", "the container")
+            note = f"rate: {rate:.6g} pictures a second, from the container"
         elif fps is not None:
-            note = read_from("rate", f"{fps:g} pictures a second", "--fps")
+            note = f"rate: {fps:g} pictures a second, from --fps"
         else:
-            note = assumed(
-                "rate",
-                f"{DEFAULT_FPS:g} pictures a second",
-                "the container states none; give --fps",
+            note = (
+                f"rate: {DEFAULT_FPS:g} pictures a second was assumed, because the container "
+                "states none; give --fps"
             )
         self._read_notes.append(note)
         if len(self.files) > 1:
             names = ", ".join(file.name for file in self.files)
             self._read_notes.append(f"chapters of one recording: {names}")
 
-    def _note_decoding(self, decoder: Decoder) -> None:
+    def _note_decoding(self, decoder: VideoDecoder) -> None:
         if decoder.deinterlaced_from is not None:
             self.notes.append(
                 f"{decoder.path.name} is interlaced from frame {decoder.deinterlaced_from} on; "
@@ -175,7 +174,7 @@ class VideoFile:
             self.width = round(self.width * pixel)
             what = f"{pixel:.4g} wide and 1 high; pictures of {stored} are stretched to"
             self._read_notes.append(
-                read_from("pixels", f"{what} {self.width} x {self.height}", "the container")
+                f"pixels: {what} {self.width} x {self.height}, from the container"
             )
         if camera is None:
             return None
@@ -208,7 +207,7 @@ def _chapters(path: Path) -> list[Path]:
 
 
 def _frame_count(path: Path) -> int:
-    with Decoder(path) as decoder:
+    with VideoDecoder(path) as decoder:
         return decoder.frame_count
 
 

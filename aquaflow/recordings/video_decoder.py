@@ -34,7 +34,7 @@ LEAST_PIXEL, MOST_PIXEL = 0.25, 4.0
 """Width of a pixel in its heights; anamorphic video has 0.75 to 2, anything beyond is damage."""
 
 
-class Decoder:
+class VideoDecoder:
     """Pictures in order, each after :meth:`grab`; silent on stderr.
 
     A picture that the decoder complained about is none. A codec shows pictures in another order

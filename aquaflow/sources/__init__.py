@@ -48,16 +48,6 @@ class CameraSource(Protocol):
     def close(self) -> None: ...
 
 
-def read_from(what: str, value: str, source: str) -> str:
-    """The note of a camera or of telemetry on what it took from the recording itself."""
-    return f"{what}: {value}, from {source}"
-
-
-def assumed(what: str, value: str, because: str) -> str:
-    """The note of a camera or of telemetry on a guess; without one, nothing may be guessed."""
-    return f"{what}: {value} was assumed, because {because}"
-
-
 def is_asked(index: int, every: int, start: int) -> bool:
     """True for the indices ``start, start + every, ...`` of :meth:`CameraSource.frames`."""
     return index >= start and (index - start) % every == 0
@@ -107,6 +97,20 @@ class RecordedCamera(CameraSource, Protocol):
 
         Raises:
             InputError: the recording cannot be read at all.
+        """
+        ...
+
+
+@runtime_checkable
+class TopicReader(Protocol):
+    """A recorded camera whose recordings may hold pictures on several topics."""
+
+    @classmethod
+    def topic_of(cls, path: Path, topic: str) -> RecordedCamera:
+        """Open the pictures on ``topic``.
+
+        Raises:
+            InputError: the recording has no pictures there.
         """
         ...
 
@@ -175,10 +179,9 @@ def open_recording(
         raise InputError(f"there is nothing at {path}; give a folder of images or a video file")
     reader = camera_reader(path)
     if reader is not None and topic is not None:
-        if not hasattr(reader, "topic_of"):
+        if not isinstance(reader, TopicReader):
             raise InputError(f"{path} has no topics; leave out --topic")
-        chosen: RecordedCamera = reader.topic_of(path, topic)  # type: ignore[attr-defined]
-        return chosen
+        return reader.topic_of(path, topic)
     if reader is not None:
         return reader.open(path, fps=fps)
     names = ", ".join(sorted(entry.name for entry in entry_points(group=CAMERAS)))

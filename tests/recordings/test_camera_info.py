@@ -12,7 +12,7 @@ import yaml
 
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.camera_file import save_camera
-from aquaflow.recordings.camera_info import camera_of_info, info_topic, is_rectified, preferred
+from aquaflow.recordings.camera_info import camera_of_info, choose_topic, info_topic, is_rectified
 
 
 def info(**changes: Any) -> SimpleNamespace:
@@ -86,7 +86,7 @@ def test_rectified_topics_and_the_topic_to_map_are_told_by_name() -> None:
     assert is_rectified("/cam/image_rect_color/compressed")
     assert not is_rectified("/rect/image_raw")
     counts = [("/camera/aligned_depth/image_raw", 90), ("/camera/color/image_raw", 30)]
-    assert preferred(counts) == "/camera/color/image_raw"
+    assert choose_topic(counts) == "/camera/color/image_raw"
 
 
 def test_a_calibration_of_numpys_numbers_is_written(tmp_path: Path) -> None:

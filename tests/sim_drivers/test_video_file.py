@@ -13,7 +13,7 @@ from aquaflow.geometry.camera_file import save_camera
 from aquaflow.recordings import video
 from aquaflow.recordings.picture import UnreadablePictureError
 from aquaflow.recordings.video import VideoFile
-from aquaflow.recordings.video_decoder import Decoder
+from aquaflow.recordings.video_decoder import VideoDecoder
 from aquaflow.types import Dropped
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -129,7 +129,7 @@ def test_times_that_do_not_increase_are_set_from_the_frame_rate():
 
 
 def test_repaired_times_are_noted(clip, monkeypatch):
-    monkeypatch.setattr(Decoder, "position_ms", 0.0)
+    monkeypatch.setattr(VideoDecoder, "position_ms", 0.0)
     source = VideoFile.open(clip, fps=10.0)
     times = [frame.t_ns for frame in source.frames(stop=3)]
 
@@ -182,6 +182,6 @@ def test_what_a_container_does_not_know_counts_as_unknown(clip):
         def get(self, number):
             return float("nan")
 
-    decoder = Decoder(clip)
+    decoder = VideoDecoder(clip)
     decoder._capture = Unsure()
     assert decoder._property(7) == 0.0
