@@ -126,10 +126,11 @@ def test_frames_that_a_failing_tracker_held_are_accounted_for(
         raise FloatingPointError("planted")
 
     monkeypatch.setattr(Tracker, "_begin", lose_all)
+    monkeypatch.setattr(Tracker, "_shown_somewhere", lambda *_: None)  # it finds them again
     finished = mapped(open_recording(small_recording), tmp_path / "dive")
     table = rows(finished.dive)
     assert [int(row["index"]) for row in table] == list(range(len(table)))
-    assert sum(row["class"] == "lost" for row in table) == finished.metrics["lost"]
+    assert sum(row["class"] == "lost" for row in table) == finished.metrics["lost"] > 0
 
 
 class Unreliable:
