@@ -173,14 +173,14 @@ class _Model:
         x: Array,  # [9]
     ) -> Array:
         """[3 U] rad/s, predicted less seen."""
-        return (self._predicted(x) - self.seen).ravel()
+        return (self._predict(x) - self.seen).ravel()
 
     def jacobian(
         self,
         x: Array,  # [9]
     ) -> Array:
         """[3 U, 9]"""
-        M, predicted = np.exp(x[LOG_SCALE]) * self.R_cb(x), self._predicted(x)
+        M, predicted = np.exp(x[LOG_SCALE]) * self.R_cb(x), self._predict(x)
         later, earlier = (self._body_rate(x, sign * DERIVATIVE_S) for sign in (1.0, -1.0))
         J = np.empty((len(self.seen), 3, PARAMETERS))
         J[:, :, OFFSET] = (later - earlier) @ M.T / (2.0 * DERIVATIVE_S)
@@ -190,7 +190,7 @@ class _Model:
         J[:, :, LOG_SCALE] = predicted
         return J.reshape(-1, PARAMETERS)
 
-    def _predicted(
+    def _predict(
         self,
         x: Array,  # [9]
     ) -> Array:

@@ -8,8 +8,9 @@ left, that one is taken up again: hovering adds none.
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -137,9 +138,9 @@ class KeyframeTracker:
             pair = self._prior.decode(self._reference(at), encoding)
             solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
         keyframe, wide = at.keyframe, self._wide_steps
-        if solved is not None and wide.contradicted(solved):
+        if solved is not None and wide.is_contradicted(solved):
             reference = self._reference(at)
-            solved = wide.confirmed(keyframe, reference, encoding, camera, solved, predicted)
+            solved = wide.confirm(keyframe, reference, encoding, camera, solved, predicted)
         if wide.doubtful(keyframe, solved, at.T_fk, predicted, camera):
             reference = self._reference(at)
             return wide.best(keyframe, reference, encoding, camera, solved, predicted)
@@ -258,7 +259,7 @@ class KeyframeTracker:
 
     # --- keyframes left behind ----------------------------------------------------------------
 
-    def release(self, at: CurrentKeyframe) -> None:
+    def register(self, at: CurrentKeyframe) -> None:
         """Register the keyframe, so that tracking may return to it."""
         self.neighbours.add(at.keyframe)
         self._recent.append(at.keyframe)
@@ -269,32 +270,34 @@ class KeyframeTracker:
         """One of the keyframes left last that shows a frame which ``at``, the one in use, does not:
         keypoints say where, dense matches whether. The first frame after a loss is often still in
         view of one, where it is not of the last."""
-        for keyframe in reversed(self._recent):
-            if at is not None and keyframe is at.keyframe:
-                continue
-            try:
-                solved = self._wide_steps.shown_by(keyframe, encoding, camera)
-                if solved is None:
-                    continue
+        others = (each for each in reversed(self._recent) if at is None or each is not at.keyframe)
+        for keyframe, solved in self._showing(others, encoding, camera):
+            with contextlib.suppress(InputError):  # it cannot be read back
                 self._keyframes.load(keyframe.number)
-            except InputError:
-                continue  # a keyframe that cannot be read back is skipped
-            return CurrentKeyframe(keyframe, T_fk=solved.estimate.T, matches=solved.pair.matches)
+                T_fk, matches = solved.estimate.T, solved.pair.matches
+                return CurrentKeyframe(keyframe, T_fk=T_fk, matches=matches)
         return None
 
     def tracked_at(
         self, keyframes: Sequence[Keyframe], frame: Frame, encoding: Encoding, camera: CameraModel
     ) -> Tracked | None:
         """A frame at the first of ``keyframes`` that shows it; no keyframe is changed."""
+        for keyframe, solved in self._showing(keyframes, encoding, camera):
+            there = CurrentKeyframe(keyframe, T_fk=solved.estimate.T)
+            return there.tracked_result(frame, FrameClass.COMMON, solved.quality)
+        return None
+
+    def _showing(
+        self, keyframes: Iterable[Keyframe], encoding: Encoding, camera: CameraModel
+    ) -> Iterator[tuple[Keyframe, Matched]]:
+        """Those of ``keyframes`` that show a frame; one that cannot be read back is skipped."""
         for keyframe in keyframes:
             try:
                 solved = self._wide_steps.shown_by(keyframe, encoding, camera)
             except InputError:
-                continue  # a keyframe that cannot be read back is skipped
+                continue
             if solved is not None:
-                there = CurrentKeyframe(keyframe, T_fk=solved.estimate.T)
-                return there.tracked_result(frame, FrameClass.COMMON, solved.quality)
-        return None
+                yield keyframe, solved
 
     def take_up(self, back: CurrentKeyframe) -> None:
         """Hold an earlier keyframe in memory: tracking goes on there."""

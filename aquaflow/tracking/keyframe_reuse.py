@@ -91,7 +91,7 @@ class KeyframeReuse:
         if self.was_in_vain(at):
             return True
         if self._looked_already(at, solved):
-            self._keyframe_tracker.release(at)
+            self._keyframe_tracker.register(at)
             return False
         neighbours = self._keyframe_tracker.neighbours
         around = neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
@@ -136,7 +136,7 @@ class KeyframeReuse:
         """None was found: the keyframe in use is kept in a crowded place, else a new one is due."""
         if self._is_crowded(look) and look.solved.share >= self._config.crowd_share:
             look.at.kept = look.t_ns, look.solved.share
-            self._keyframe_tracker.release(look.at)  # its points are kept, as of one that is left
+            self._keyframe_tracker.register(look.at)  # its points are kept, as of one that is left
         else:
             self._in_vain = look.at
 

@@ -163,7 +163,7 @@ class Tracker:
 
     def recall(self, keyframe: Keyframe) -> None:
         """Register a keyframe of an earlier run for relocalisation."""
-        self._keyframe_tracker.release(CurrentKeyframe(keyframe))
+        self._keyframe_tracker.register(CurrentKeyframe(keyframe))
 
     def _step(self, stage: str, frame: Frame | None, decide: Callable[[], list[Tracked]]) -> Step:
         """The frames that leave with what ``decide`` decides, and the edges that it found; where it
@@ -174,9 +174,9 @@ class Tracker:
         if run.failed and frame is not None:
             self._waiting.put([frame], Wait.IN_HAND)
         edges, self._edges = self._edges, Step()
-        return replace(edges, frames=self._kept(self._waiting.settle(decided, self._as_lost)))
+        return replace(edges, frames=self._hold_lost(self._waiting.settle(decided, self._as_lost)))
 
-    def _kept(self, leaving: list[Tracked]) -> list[Tracked]:
+    def _hold_lost(self, leaving: list[Tracked]) -> list[Tracked]:
         """Those that leave; in a replay, frames that are lost wait for its end."""
         if self._ending or not self._worker.in_step:
             return leaving
@@ -312,7 +312,7 @@ class Tracker:
             return None
         back, solved_back = found.back
         self._keyframe_tracker.take_up(back)
-        self._keyframe_tracker.release(at)
+        self._keyframe_tracker.register(at)
         revisit = self._join(at, look.solved, back, solved_back, look.camera)
         moved_on = at.T_fk is not look.T_fk
         if moved_on:
@@ -348,7 +348,7 @@ class Tracker:
         assert self._at is not None
         self._origin = self._at.T_wc
         self.sub_map, self.sub_maps = self.sub_maps, self.sub_maps + 1
-        self._keyframe_tracker.release(self._at)
+        self._keyframe_tracker.register(self._at)
         self._at = None
         lost = self._waiting.move(Wait.LOST, Wait.IN_HAND)
         return [tracked for frame in lost for tracked in self._track(frame)]
@@ -377,7 +377,7 @@ class Tracker:
                 self._keyframes.load(before.keyframe.number)
             return []
         if before is not None:
-            self._keyframe_tracker.release(before)
+            self._keyframe_tracker.register(before)
         self._start.end()
         return [*self._back_fill(), tracked]
 
@@ -430,7 +430,7 @@ class Tracker:
         estimate = solved.estimate
         link = KeyframeEdge(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
         self.sub_map = at.keyframe.sub_map
-        keyframe_tracker.release(at)
+        keyframe_tracker.register(at)
         self._solved = None
         self._joined.add((len(self._keyframes), at.keyframe.number))
         new = keyframe_tracker.at_new_keyframe

@@ -56,14 +56,14 @@ class WideSteps:
         steps = solved.estimate.T, predicted
         return any(is_wide(keyframe.pointmap, T_before, step, camera) for step in steps)
 
-    def contradicted(self, solved: Matched) -> bool:
+    def is_contradicted(self, solved: Matched) -> bool:
         """True if much of what the pose puts into view is not matched there."""
         return (
             solved.visibility.seen < CONFIRMED_SEEN
             and solved.estimate.inlier_share < self._config.sure_inlier_share
         )
 
-    def confirmed(
+    def confirm(
         self,
         keyframe: Keyframe,
         reference: Encoding,
@@ -78,7 +78,7 @@ class WideSteps:
             rival = self._from_pose(keyframe, reference, encoding, camera, pose)
             if rival is not None and rival.explained > solved.explained:
                 solved = rival
-            if not self.contradicted(solved):
+            if not self.is_contradicted(solved):
                 break
         return solved
 

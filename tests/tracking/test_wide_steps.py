@@ -205,7 +205,7 @@ def test_a_lost_frame_is_looked_for_in_the_keyframes_left_last() -> None:
     store = KeyframeStore()
     first, second = keyframe_at(HERE, store), keyframe_at(far, store)
     tracker = KeyframeTracker(PRIOR, store, TrackingConfig())
-    tracker.release(CurrentKeyframe(first))
+    tracker.register(CurrentKeyframe(first))
     back = pose((0.0, 0.0, 0.1), (0.3, 0.1, 0.0))
     there = tracker.recent(
         CurrentKeyframe(second), PRIOR.encode(FLOOR.picture(back), CAMERA), CAMERA

@@ -82,7 +82,7 @@ def is_measured(
 
 
 @dataclass(frozen=True)
-class _Equations:
+class _BundleEquations:
     """Of C numbers of the cameras and P inverse depths."""
 
     H_cc: Array
@@ -206,8 +206,8 @@ class _System:
             Jc[6] = (P * shrinks[:, None]).sum(0) + np.stack([fx * x, fy * y])
         return Jc, np.tensordot(T.t, P, 1)
 
-    def linearise(self, bundle: Bundle) -> _Equations:
-        return _Equations(*self._blocks(bundle), self.cost(bundle))
+    def linearise(self, bundle: Bundle) -> _BundleEquations:
+        return _BundleEquations(*self._blocks(bundle), self.cost(bundle))
 
     def move(
         self,

@@ -78,7 +78,7 @@ class PixelEquations:
         """H [6, 6], g [6] and cost of the weighted Huber loss at ``T``."""
         return self._evaluate(T, None)
 
-    def linearise_at(self, T: Sim3) -> tuple[Array, Array]:
+    def residuals_and_pulls(self, T: Sim3) -> tuple[Array, Array]:
         """Residuals [2, M] at ``T``, and what each match pulls by [6, M]: weighted J' residual."""
         count = len(self._matches)
         residual, pull = np.empty((2, count)), np.empty((6, count))

@@ -82,7 +82,7 @@ def solve_pose(
         return None
     H = descent.linearise(found.state).H
     return _summary(
-        len(problem.points), matches, found.state, H, *equations.linearise_at(found.state)
+        len(problem.points), matches, found.state, H, *equations.residuals_and_pulls(found.state)
     )
 
 
@@ -126,7 +126,7 @@ class RowEquations:
         cost = float(KERNEL.cost(np.abs(rows.residual)).sum(0) @ weights)
         return *_normal_equations(rows, weights), cost
 
-    def linearise_at(self, T: Sim3) -> tuple[Array, Array]:
+    def residuals_and_pulls(self, T: Sim3) -> tuple[Array, Array]:
         """Residuals [K, M] at ``T``, and what each match pulls by [n, M]: weighted J' residual."""
         rows = self._linearise(self._matches, T)
         pull = KERNEL.weight(np.abs(rows.residual)) * rows.residual * self._matches.weights

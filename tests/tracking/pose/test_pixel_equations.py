@@ -44,7 +44,9 @@ def test_compiled_equations_are_those_of_the_rows(at: Sim3, around: bool) -> Non
     for found, expected in zip(compiled.at(at), readable.at(at), strict=True):
         scale = np.abs(expected).max()
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * scale)
-    for found, expected in zip(compiled.linearise_at(at), readable.linearise_at(at), strict=True):
+    for found, expected in zip(
+        compiled.residuals_and_pulls(at), readable.residuals_and_pulls(at), strict=True
+    ):
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
