@@ -89,6 +89,9 @@ class Browser:
         return str(self.run("return document.querySelector(arguments[0]).innerText", selector))
 
     def click(self, selector: str) -> None:
+        """As a person does: once it is seen and not grey."""
+        found = f"document.querySelector({json.dumps(selector)})"
+        self.wait(f"{found}?.checkVisibility() && !{found}.disabled")
         self._ask("POST", f"{self._session}/element/{self._find(selector)}/click", {})
 
     def type(self, selector: str, text: str) -> None:

@@ -157,7 +157,6 @@ def test_a_pilot_dives_with_the_buttons_of_the_page(rov: BlueRov2, tmp_path: Pat
         browser.wait("!document.querySelector('#login').hidden")
         browser.type("#token", TOKEN)
         browser.click("#login button")
-        browser.wait("document.querySelector('[data-action=start]:enabled')")
         browser.click("[data-action=start]")
         browser.wait("document.querySelector('#state').textContent === 'Tracking'")
         browser.wait("document.querySelector('#plan-frame polyline')")
