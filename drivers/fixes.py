@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from aquaflow.config.device import PositioningConfig
+from aquaflow.config.stage import PositioningConfig
 from aquaflow.types import Position, TelemetrySample
 
 UERE_M = 5.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.drivers.fixes import move
 from aquaflow.drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 from aquaflow.types import (

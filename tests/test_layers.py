@@ -212,7 +212,7 @@ def test_no_test_imports_another_test(path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "source", "problem"),
     [
-        ("aquaflow/base/signals.py", "from aquaflow.slam import Slam", "on a floor above"),
+        ("aquaflow/base/worker.py", "from aquaflow.slam import Slam", "on a floor above"),
         ("aquaflow/tracking/x.py", "import aquaflow.mapping.mapper", "slam connects them"),
         ("aquaflow/water/x.py", "import aquaflow.tracking.tracker", "slam connects them"),
         ("aquaflow/slam.py", "def f():\n    from aquaflow import survey", "on a floor above"),
@@ -238,7 +238,7 @@ def test_an_import_from_above_or_the_side_is_found(path: str, source: str, probl
         ("aquaflow/recordings/x.py", "import aquaflow.drivers.can"),
         ("aquaflow/tracking/tracker.py", "from . import frames\nfrom .frames import Tracked"),
         ("aquaflow/keyframes/store.py", "from aquaflow.prior.contract import Encoding"),
-        ("aquaflow/base/signals.py", "from aquaflow import __version__\nimport numpy, re"),
+        ("aquaflow/base/worker.py", "from aquaflow import __version__\nimport numpy, re"),
     ],
 )
 def test_imports_from_below_or_from_the_same_family_are_allowed(path: str, source: str) -> None:

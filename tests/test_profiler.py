@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.base import profiler
-from aquaflow.base.profiler import Profiler
+from aquaflow.base import stages as profiler
+from aquaflow.base.stages import Profiler
 from tests.command_line import Cli
 from tests.small_recording import QUICK
 

@@ -7,10 +7,15 @@ done: results are plain data, taken in the order of asking.
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import os
+import signal
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Event
 from typing import Any, TypeVar
 
 from aquaflow.base.errors.failures import Failures
@@ -97,3 +102,52 @@ class Worker:
             if threads is not None:
                 threads.shutdown(cancel_futures=True)
         self._asked.clear()
+
+
+# --- ----------------------------------------------------------------------------------------------
+# How many threads may work: one for each core, however many are asked for.
+#
+# More only wait for each other, and thousands of them stop the machine.
+
+log = logging.getLogger(__name__)
+
+
+def core_count() -> int:
+    """Cores of this machine."""
+    return os.cpu_count() or 1
+
+
+def usable_threads(asked: int | None) -> int:
+    """``asked``, or every core if None, and never more than there are; warns where it is less."""
+    cores = core_count()
+    if asked is None or asked <= cores:
+        return asked or cores
+    log.warning("note: %d threads were asked for; one for each of %d cores is used", asked, cores)
+    return cores
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Clean end of a long run on SIGINT (Ctrl-C) or SIGTERM (systemd).
+
+ASKED = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def stop_on_signals(*stopping: Event, once: bool = False) -> Iterator[None]:
+    """Either signal sets all of ``stopping``; with ``once``, the next one ends the process as it
+    stands. The previous handlers are restored at the end."""
+
+    def stop(*_: object) -> None:
+        for event in stopping:
+            event.set()
+        for each in ASKED if once else ():
+            signal.signal(each, signal.SIG_DFL)
+
+    before: list[Callable[..., object] | int | None] = []
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
+        before = [signal.signal(each, stop) for each in ASKED]
+    try:
+        yield
+    finally:
+        for each, handler in zip(ASKED, before, strict=False):
+            signal.signal(each, handler)

@@ -12,11 +12,9 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import ConfigError, InputError, reason_of
 from aquaflow.base.storage.atomic import write_json
-from aquaflow.calibration.board import Board, Detector
+from aquaflow.calibration.board import Board, Detector, Views, find_views
 from aquaflow.calibration.fit import CalibrationFit, fit_lens, fit_port
-from aquaflow.calibration.views import Views, find_views
-from aquaflow.geometry.camera import CameraModel, DistortionModel
-from aquaflow.geometry.camera_file import save_camera, save_for_others
+from aquaflow.geometry.camera import CameraModel, DistortionModel, save_camera, save_for_others
 from aquaflow.geometry.port import FlatPort
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame

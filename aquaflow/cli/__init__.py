@@ -27,9 +27,8 @@ from aquaflow.cli.console import (
     progress_bars,
     unit_in_words,
 )
-from aquaflow.cli.doctor import config, doctor_group
+from aquaflow.cli.doctor import config, doctor_group, inspect
 from aquaflow.cli.export import export_group
-from aquaflow.cli.inspect import inspect
 from aquaflow.cli.lab import lab_group
 from aquaflow.cli.measure import measure_group
 from aquaflow.cli.record import record

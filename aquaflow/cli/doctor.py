@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.base.errors import printable
+from aquaflow.base.errors import InputError, printable
 from aquaflow.cli.console import GroupWithDefault, Json, table_console
 
 if TYPE_CHECKING:
+    from aquaflow.sources import RecordedCamera
     from aquaflow.sources.discovery import DiscoveryResult
+    from aquaflow.types import Frame
 
 
 def doctor_group() -> typer.Typer:
@@ -126,3 +129,92 @@ def _as_yaml(config: dict[str, Any]) -> str:
     if not config:
         return ""
     return str(yaml.safe_dump(config, sort_keys=False)).rstrip()
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The command that says what would be read of a recording: ``inspect``.
+
+MOST_FRAMES = 30
+"""Pictures that are read: a second or a few."""
+MOST_SAMPLES = 2000
+"""Samples of telemetry that are read."""
+
+
+def inspect(
+    source: Annotated[Path, typer.Argument(help="Folder of pictures, video, bag, or log.")],
+    topic: Annotated[str | None, typer.Option(help="Picture topic of a bag.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what would be read of a recording, what would be assumed, and what is odd."""
+    from aquaflow.sources import camera_reader, open_recording, telemetry_reader
+
+    found: dict[str, Any] = {"source": str(source)}
+    reader = telemetry_reader(source)
+    if camera_reader(source) is not None or reader is None:
+        recording = open_recording(source, fps, topic)
+        try:
+            found |= _pictures(recording)
+        finally:
+            recording.close()
+    if reader is not None:
+        found["telemetry"] = _telemetry(reader, source)
+    if as_json:
+        typer.echo(json.dumps(found))
+        return
+    for name, value in found.items():
+        for each in value if isinstance(value, list) else [value]:
+            typer.echo(printable(f"{name:>12}  {_in_words(each)}"))
+
+
+def _pictures(recording: RecordedCamera) -> dict[str, Any]:
+    from aquaflow.sources.picture_check import oddities
+    from aquaflow.types import Frame
+
+    read = list(islice(recording.frames(), MOST_FRAMES))
+    frames: list[Frame] = [each for each in read if isinstance(each, Frame)]
+    found: dict[str, Any] = {"pictures": recording.frame_count or f"at least {len(read)}"}
+    odd = [each.reason for each in read if not isinstance(each, Frame)][:3]
+    if frames:
+        height, width = frames[0].image.shape[:2]
+        found["size"] = f"{width} x {height}"
+        span_s = 1e-9 * (frames[-1].t_ns - frames[0].t_ns)
+        if span_s > 0.0:
+            found["rate_hz"] = round((len(frames) - 1) / span_s, 3)
+        camera = recording.camera
+        found["calibration"] = (
+            "none: a focal length is assumed and refined"
+            if camera is None
+            else f"fx {camera.fx:.1f} px of {camera.width}, {camera.distortion_model}"
+        )
+        odd += oddities([frame.image for frame in frames])
+    found["notes"] = list(recording.notes)
+    found["odd"] = odd
+    return found
+
+
+def _telemetry(reader: Any, source: Path) -> list[dict[str, Any]]:
+    opened = reader.open(source)
+    kinds: dict[str, list[int]] = {}
+    try:
+        for sample in islice(opened.samples(), MOST_SAMPLES):
+            kinds.setdefault(type(sample).__name__, []).append(sample.t_ns)
+    except InputError as error:
+        return [{"kind": "none", "problem": str(error)}]
+    finally:
+        opened.close()
+    return [
+        {"kind": kind, "read": len(times), "from_s": min(times) * 1e-9, "to_s": max(times) * 1e-9}
+        for kind, times in sorted(kinds.items())
+    ]
+
+
+def _in_words(value: Any) -> str:
+    if not isinstance(value, dict):
+        return str(value)
+    if "problem" in value:
+        return str(value["problem"])
+    return (
+        f"{value['kind']}: {value['read']} read, {value['from_s']:.2f} to {value['to_s']:.2f} s "
+        "after the first picture"
+    )

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.base.cores import usable_threads
-from aquaflow.cli.console import Json, progress_bars, table_console
-from aquaflow.cli.prior_describe import describe
-from aquaflow.cli.prior_verify import print_parity, verify
+from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.base.worker import usable_threads
+from aquaflow.cli.console import Json, one_of, progress_bars, table_console
+
+if TYPE_CHECKING:
+    from aquaflow.prior.folder import PriorCard
 
 
 class Exported(str, Enum):
@@ -229,3 +232,201 @@ def train_compact(
         typer.echo(f"stopped after {hours} hours; give the same command to go on")
     else:
         typer.echo(f"written to {out / PRIOR}: {json.dumps(record['held_out'])}")
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The command that makes a prior of the user's own depth network. Thin, like all of cli/.
+
+DEFAULT_WIDTH, DEFAULT_HEIGHT = 518, 392
+"""px: multiples of 14, as transformers of patches of 14 px need them."""
+
+
+def describe(
+    network: Annotated[Path, typer.Argument(help="ONNX file of a monocular depth network.")],
+    out: Annotated[Path, typer.Option(help="New folder to write, for prior.folder.")],
+    measure: Annotated[str, typer.Option(help="depth | inverse_depth | log_depth")],
+    unit: Annotated[
+        str, typer.Option(help="metres | unknown | affine (inverse depth up to scale and shift)")
+    ],
+    input_name: Annotated[str | None, typer.Option("--input", help="Name, if several.")] = None,
+    output_name: Annotated[str | None, typer.Option("--output", help="Name, if several.")] = None,
+    multiple: Annotated[
+        int | None, typer.Option(min=1, help="px that sides of pictures are multiples of.")
+    ] = None,
+    width: Annotated[int, typer.Option(min=16, max=4096, help="px, if the network takes any.")] = (
+        DEFAULT_WIDTH
+    ),
+    height: Annotated[int, typer.Option(min=16, max=4096, help="px, if the network takes any.")] = (
+        DEFAULT_HEIGHT
+    ),
+    mean: Annotated[str, typer.Option(help="Of the channels in [0, 1].")] = "0.485,0.456,0.406",
+    std: Annotated[str, typer.Option(help="Of the channels in [0, 1].")] = "0.229,0.224,0.225",
+    channels: Annotated[str, typer.Option(help="rgb | bgr")] = "rgb",
+    relative_error: Annotated[
+        float, typer.Option(min=0.001, max=2.0, help="1 sigma of depth, as a share of it.")
+    ] = 0.15,
+    confidence: Annotated[str | None, typer.Option(help="Name of that output.")] = None,
+    confidence_kind: Annotated[str, typer.Option(help="weight | sigma | log_variance")] = "weight",
+    licence: Annotated[str, typer.Option(help="Of the network, for its card.")] = "not stated",
+    as_json: Json = False,
+) -> None:
+    """Write a depth network of your own as a prior, after one test run."""
+    from aquaflow.prior import describe as describing
+
+    inputs, outputs = describing.names_of(network)
+    taken = input_name or describing.only(list(inputs), "input", "--input")
+    stated: dict[str, Any] = {
+        "input": taken,
+        "output": output_name or describing.only(outputs, "output", "--output"),
+        "multiple_px": multiple or _multiple(inputs.get(taken, ())),
+        "mean": _three(mean, "--mean"),
+        "std": _three(std, "--std"),
+        "channels": channels,
+        "measure": measure,
+        "unit": unit,
+        "relative_error": relative_error,
+        "confidence": confidence,
+        "confidence_kind": confidence_kind,
+    }
+    card = describing.depth_card(stated)
+    found = describing.describe(network, out, card, width, height, licence)
+    result = {"width": found.width, "height": found.height, "ms": round(1e3 * found.seconds, 1)}
+    if as_json:
+        typer.echo(json.dumps({"folder": str(out), **result, "known": round(found.known, 3)}))
+    else:
+        typer.echo(
+            f"written to {out}: {result['width']} x {result['height']} px in {result['ms']} ms, "
+            f"{100.0 * found.known:.0f} % of the pixels with a depth; set prior.kind: folder and "
+            f"prior.folder: {out}"
+        )
+
+
+def _multiple(shape: tuple[int | str, ...]) -> int:
+    """Of a network that takes one size: any."""
+    if len(shape) >= 2 and all(isinstance(side, int) for side in shape[-2:]):
+        return 1
+    raise InputError(
+        "the network takes pictures of any size; give --multiple, the number of px that their "
+        "sides must be multiples of (14 for Depth Anything)"
+    )
+
+
+def _three(text: str, option: str) -> tuple[float, ...]:
+    """Three numbers with commas between them."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3:
+        raise InputError(f"{option} is {text!r}; give three numbers, as 0.5,0.5,0.5")
+    return numbers
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The command that checks a prior's files, here and where they are to run. Thin, as all of cli/.
+
+MOST_RELATIVE = 1e-4
+"""Difference between ONNX and torch, relative to an output's largest value, that is parity."""
+
+
+DEVICES = ("cpu", "cuda", "tensorrt")
+"""Processors that a prior may be verified on."""
+PRECISIONS = ("fp32", "fp16", "int8")
+"""Precisions that it may be verified in."""
+
+Folder = Annotated[
+    Path | None, typer.Argument(help="Exported prior; default: a tiny one, exported on the spot.")
+]
+Checkpoint = Annotated[
+    Path | None,
+    typer.Option(help="Weights to compare with; without, what was measured at export is shown."),
+]
+On = Annotated[
+    str | None,
+    typer.Option(help="cpu | cuda | tensorrt: run there, too, and compare with the CPU."),
+]
+In = Annotated[
+    str, typer.Option(help="fp32 | fp16 | int8: of the run on --device; fp16 is TensorRT's.")
+]
+
+
+def verify(
+    folder: Folder = None,
+    checkpoint: Checkpoint = None,
+    device: On = None,
+    precision: In = "fp32",
+    as_json: Json = False,
+) -> None:
+    """Compare every output of the ONNX files with torch's, and with --device what tracking gets
+    there with what it gets from the CPU in 32 bits; exit code 1 where they differ."""
+    from aquaflow.prior.folder import read_card
+    from aquaflow.prior.mast3r.export import verify_tiny
+    from aquaflow.prior.runtime import RuntimeSettings
+    from aquaflow.prior.verification import check, differences
+
+    settings = None
+    if device is not None:
+        where: Any = one_of(DEVICES, device, "--device")
+        how: Any = one_of(PRECISIONS, precision, "--precision")
+        settings = RuntimeSettings(where, how)
+    if folder is None and device is not None:
+        raise InputError(f"nothing to run on {device}; give the folder of a prior")
+    if folder is None:
+        with TemporaryDirectory() as scratch, progress_bars(as_json) as advance:
+            name, parity = "mast3r (tiny)", verify_tiny(Path(scratch) / "prior", advance)
+    else:
+        card = read_card(folder)
+        name, parity = card.name, card.parity
+        if checkpoint is not None:
+            parity = _parity_with(checkpoint, folder, card)
+    there = {} if folder is None or settings is None else differences(folder, settings)
+    print_parity(name, parity, there, as_json)
+    worst = max(parity.values(), default=0.0)
+    if not worst <= MOST_RELATIVE:
+        raise AquaFlowError(
+            f"prior {name} differs from torch by {worst:.1e}, more than {MOST_RELATIVE:.0e}; "
+            "export it again"
+        )
+    if settings is not None:
+        check(name, there, settings)
+
+
+def _parity_with(checkpoint: Path, folder: Path, card: PriorCard) -> dict[str, float]:
+    from aquaflow.prior.compact import export as compact
+    from aquaflow.prior.mast3r import export as mast3r
+    from aquaflow.prior.mast3r.weights import load_checkpoint
+
+    if card.name == "compact":
+        return compact.parity_of(compact.load_checkpoint(checkpoint), folder)
+    if card.name == "mast3r":
+        return mast3r.parity_of(load_checkpoint(checkpoint), folder, card.width, card.height)
+    raise InputError(f"{folder} is of no network that we have in torch; leave out --checkpoint")
+
+
+def print_parity(
+    name: str, parity: dict[str, float], there: dict[str, float], as_json: bool
+) -> None:
+    """Both tables, or one JSON object."""
+    if as_json:
+        result: dict[str, Any] = {
+            key: [{"prior": name, "name": output, "max_rel": x} for output, x in found.items()]
+            for key, found in (("outputs", parity), ("on_device", there))
+        }
+        typer.echo(json.dumps(result))
+        return
+    for title, found in (("ONNX against torch", parity), ("device against CPU", there)):
+        if found:
+            _print_table(f"{name}: {title}", found)
+    if not parity and not there:
+        typer.echo(f"{name}: the files are whole; it is of no network that we have in torch")
+
+
+def _print_table(title: str, found: dict[str, float]) -> None:
+    from rich.table import Table
+
+    table = Table(title=title)
+    table.add_column("output")
+    table.add_column("largest relative difference", justify="right")
+    for output, difference in found.items():
+        table.add_row(output, f"{difference:.1e}")
+    table_console().print(table)

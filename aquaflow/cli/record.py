@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aquaflow.base.signals import stop_on_signals
+from aquaflow.base.worker import stop_on_signals
 from aquaflow.cli.console import Json, Seconds, progress_bars
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def record(
 
 
 def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
-    from aquaflow.config.recording import RecordingConfig
+    from aquaflow.config.service import RecordingConfig
     from aquaflow.config.stage import validate
 
     asked = vehicle.recording.model_dump() | {"picture": picture}

@@ -157,8 +157,8 @@ def view(
 ) -> None:
     """Show a finished dive or a site in a browser, to look around and to measure; until Ctrl-C."""
     from aquaflow.base.errors import InputError
+    from aquaflow.config.service import ViewerConfig
     from aquaflow.config.stage import validate
-    from aquaflow.config.viewer import ViewerConfig
     from aquaflow.survey.site.manifest import is_site
     from aquaflow.survey.viewer.finished import note_unfinished, open_dive
     from aquaflow.survey.viewer.site_page import open_site

@@ -11,9 +11,8 @@ from typing import Any
 
 from pydantic import Field
 
-from aquaflow.base.errors.plain_yaml import read_mapping
-from aquaflow.config.coverage import CoverageConfig
-from aquaflow.config.fusion import FusionConfig
+from aquaflow.base.errors.regular_file import read_mapping
+from aquaflow.config.cameras import PicturesConfig, SourceConfig
 from aquaflow.config.mapping import (
     DecoderConfig,
     InsertionConfig,
@@ -25,11 +24,10 @@ from aquaflow.config.mapping import (
     VoxelConfig,
     WaterPriorsConfig,
 )
-from aquaflow.config.old_keys import understood, without_old_keys
-from aquaflow.config.pictures import PicturesConfig
 from aquaflow.config.prior import PriorConfig
-from aquaflow.config.source import SourceConfig
-from aquaflow.config.stage import StageConfig, validate
+from aquaflow.config.service import CoverageConfig
+from aquaflow.config.stage import StageConfig, understood, validate, without_old_keys
+from aquaflow.config.telemetry import FusionConfig
 from aquaflow.config.tracking import (
     GateConfig,
     GraphConfig,

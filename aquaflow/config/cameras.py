@@ -7,8 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.device import MountingConfig
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import MountingConfig, StageConfig
 
 
 class LiveCameraConfig(StageConfig):
@@ -145,3 +144,42 @@ class StreamConfig(LiveCameraConfig):
 CameraConfig: TypeAlias = Annotated[
     V4l2Config | OakConfig | StreamConfig, Field(discriminator="kind")
 ]
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of a source: which frames, and how they are prepared.
+
+
+class SourceConfig(StageConfig):
+    """Which frames, and how they are prepared."""
+
+    every: int = Field(1, ge=1, description="use every n-th frame")
+    start: int = Field(0, ge=0, description="first frame index")
+    stop: int | None = Field(None, ge=1, description="first frame index not used")
+    width: int | None = Field(
+        None,
+        ge=64,
+        le=8192,
+        description="px; frames are made this wide (None: 480, or less if smaller)",
+    )
+    crop: str | None = Field(None, description="left | right | x,y,width,height, before resizing")
+    mask: Path | None = Field(
+        None,
+        description="picture of the camera's or the crop's size: white is used, black is not "
+        "(vehicle frame, display)",
+    )
+    fps: float | None = Field(None, gt=0, description="frames/s of a folder without timestamps")
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of the small pictures that a dive keeps of what its camera saw.
+
+
+class PicturesConfig(StageConfig):
+    """One a second, for the viewer; fewer of a long dive."""
+
+    enabled: bool = Field(True, description="False: none are kept")
+    most_mb: float = Field(
+        64.0, gt=0, description="MB (1e6 bytes) of all pictures of a dive: where they take more, "
+        "every second one is removed, and from then on half as many are kept",
+    )  # fmt: skip

@@ -8,9 +8,8 @@ from typing import Literal
 
 from pydantic import Field, IPvAnyNetwork, model_validator
 
-from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import Port
-from aquaflow.config.stage import Lab, StageConfig
+from aquaflow.config.stage import Lab, MountingConfig, StageConfig
 
 
 def is_loopback(host: str) -> bool:
@@ -219,3 +218,89 @@ class ServiceConfig(StageConfig):
     limits: LimitsConfig = LimitsConfig()
     pose: PoseConfig = PoseConfig()
     report: VehicleReportConfig = VehicleReportConfig()
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of the recorder: how pictures are kept, and how files are cut.
+
+
+class RecordingConfig(StageConfig):
+    """How pictures are kept, how files are cut, and when to stop."""
+
+    keep_received: bool = Field(
+        True, description="keep JPEG, PNG, WebP and H.264 as the camera delivered them"
+    )
+    picture: Literal["jpeg", "png", "raw"] = Field(
+        "jpeg",
+        description="for pictures that came without such bytes; png and raw lose nothing "
+        "(measured at 640x480 on one core: jpeg 1 ms, png 10 ms, raw 28 MB/s at 30 pictures/s)",
+    )
+    jpeg_quality: int = Field(
+        95, ge=1, le=100, description="OpenCV's default; 8x8 blocks would be mapped as texture"
+    )
+    flush_s: Lab[float] = Field(
+        0.5, gt=0, le=1, description="every so often all is brought to the disk (fsync)"
+    )
+    chunk_kb: Lab[int] = Field(
+        512, ge=16, le=16_384, description="kB; a damaged place costs one chunk"
+    )
+    file_s: float = Field(600.0, gt=0, description="a new file after this long")
+    file_mb: int = Field(2000, ge=1, description="MB; a new file after this much: FAT32 holds 4 GB")
+    reserve_mb: int = Field(
+        1000, ge=0, description="MB; recording stops while so much of the disk is still free"
+    )
+    queue_mb: Lab[int] = Field(
+        128, ge=1, description="MB waiting for a slow disk: 4 s of 720p pictures; more is dropped"
+    )
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of the window into a dive.
+
+
+class ViewerConfig(ListenConfig):
+    """The live view in a browser (docs/viewer.md); off unless asked for."""
+
+    enabled: bool = False
+    port: int = Field(8231, ge=0, le=65535, description="0: any that is free")
+    splats: int = Field(
+        60_000, ge=100, description="Gaussians shown at most of a live map, which a browser gets "
+        "again as often as it changes and the link allows: 14 to 18 bytes each",
+    )  # fmt: skip
+    refresh_s: Lab[float] = Field(3.0, gt=0, description="s between pictures of the whole map")
+    pose_hz: Lab[float] = Field(4.0, gt=0, le=30, description="frustum and trajectory")
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of the coverage: what counts as seen, and how survey lines shall overlap.
+
+
+class CoverageConfig(StageConfig):
+    """What the camera has seen from above, and the lines that it was seen along."""
+
+    enabled: bool = Field(True, description="False: neither shown nor written nor hinted at")
+    cells: Lab[int] = Field(
+        16, ge=4, le=64, description="cells of the plan along the shorter side of what a picture "
+        "shows, median: 6 % of it, and 0.1 m at 2 m altitude",
+    )  # fmt: skip
+    least_views: Lab[int] = Field(
+        3, ge=1, description="keyframes that see a place well, before it counts as seen well: two "
+        "give a point, a third one contradicts a wrong match",
+    )  # fmt: skip
+    least_directions: Lab[int] = Field(
+        2, ge=1, le=17, description="different directions among its views (from above, or from one "
+        "of four sides in steps of 15 degrees): without parallax there is no range",
+    )  # fmt: skip
+    least_contrast: Lab[float] = Field(
+        0.1, gt=0, lt=0.5, description="apparent contrast of the ground's texture below which it "
+        "is too far for this water: three times the noise of a picture in dim light, 0.03 of its "
+        "signal (judgement); the texture's own contrast is taken as 0.6",
+    )  # fmt: skip
+    overlap: float = Field(
+        0.6, ge=0, le=0.95, description="wanted of neighbouring survey lines, share of the swath: "
+        "photogrammetry asks for 60 % (judgement: currents and altitude need the margin)",
+    )  # fmt: skip
+    forward_overlap: float = Field(
+        0.6, ge=0, le=0.95, description="wanted of one tracked picture with the next, share of "
+        "what a picture shows along the path",
+    )  # fmt: skip

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from aquaflow.config.can_devices import DbcConfig, Nmea2000Config
-from aquaflow.config.device import Assumptions, PositioningConfig
 from aquaflow.config.instruments import (
+    DbcConfig,
+    Nmea2000Config,
     NucleusConfig,
     Pd0Config,
     PingConfig,
@@ -18,7 +18,14 @@ from aquaflow.config.instruments import (
     WaterLinkedSerialConfig,
 )
 from aquaflow.config.link import EVERY_ADDRESS, ByteLinkConfig, MavlinkLinkConfig, UdpConfig
-from aquaflow.config.stage import StageConfig, validate
+from aquaflow.config.stage import (
+    Assumptions,
+    Lab,
+    MountingConfig,
+    PositioningConfig,
+    StageConfig,
+    validate,
+)
 
 
 class LightsConfig(StageConfig):
@@ -205,3 +212,116 @@ def parse_telemetry(data: dict[str, Any], origin: str) -> TelemetryConfig:
         ConfigError: with the path of the first key that is unknown or out of range.
     """
     return validate(TelemetryConfig, data, origin)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of the fusion of telemetry with the camera.
+
+# --- ----------------------------------------------------------------------------------------------
+# Settings of objects of known size that give the map its scale.
+
+Dictionary: TypeAlias = Literal[
+    "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11",
+    "4X4_50", "4X4_100", "4X4_250", "4X4_1000", "5X5_50", "5X5_100", "5X5_250", "5X5_1000",
+    "6X6_50", "6X6_100", "6X6_250", "6X6_1000", "7X7_50", "7X7_100", "7X7_250", "7X7_1000",
+    "ARUCO_ORIGINAL", "ARUCO_MIP_36h12",
+]  # fmt: skip
+"""Names of OpenCV's predefined dictionaries, without DICT_."""
+
+
+class MarkersConfig(StageConfig):
+    """AprilTag or ArUco markers that lie anywhere, each of the same size."""
+
+    kind: Literal["markers"] = "markers"
+    dictionary: Dictionary
+    marker_m: float = Field(gt=0, description="m, side of the black square")
+    sigma_m: float = Field(0.0005, gt=0, description="m, 1 sigma of marker_m (judgement: a ruler)")
+    ids: tuple[int, ...] = Field((), description="of the markers in use; none: every one counts")
+
+
+class CharucoConfig(StageConfig):
+    """A ChArUco board: a chessboard with markers in its white squares."""
+
+    kind: Literal["charuco"] = "charuco"
+    dictionary: Dictionary
+    columns: int = Field(ge=3, le=100, description="squares from left to right")
+    rows: int = Field(ge=3, le=100, description="squares from top to bottom")
+    square_m: float = Field(gt=0, description="m, side of a chessboard square")
+    marker_m: float = Field(gt=0, description="m, side of a marker's black square")
+    sigma_m: float = Field(0.0005, gt=0, description="m, 1 sigma of square_m (judgement: a ruler)")
+    legacy: bool = Field(False, description="printed by OpenCV before 4.6 with an even row count")
+
+    @model_validator(mode="after")
+    def _markers_fit(self) -> CharucoConfig:
+        if self.marker_m >= self.square_m:
+            raise ValueError("marker_m must be smaller than square_m")
+        return self
+
+
+BoardConfig: TypeAlias = Annotated[MarkersConfig | CharucoConfig, Field(discriminator="kind")]
+
+
+class LasersConfig(StageConfig):
+    """Two laser dots, whose beams run parallel to the optical axis."""
+
+    colour: Literal["red", "green", "blue"]
+    spacing_m: float = Field(gt=0, description="m between the beams")
+    sigma_m: float = Field(0.001, gt=0, description="m, 1 sigma of spacing_m (judgement: a ruler)")
+    parallel_sigma_deg: float = Field(
+        0.1,
+        ge=0,
+        description="deg, 1 sigma of each beam against the axis; at 2 m, 0.1 deg are 3.5 mm "
+        "(judgement: set by eye on a wall)",
+    )
+
+
+class FusionConfig(StageConfig):
+    """How telemetry gives the map its metres, its gravity and its north."""
+
+    enabled: bool = Field(True, description="False: telemetry is recorded and nothing else")
+    camera: MountingConfig | None = Field(
+        None,
+        description="of the camera in the body, which looks forward without angles, down with "
+        "pitch_deg -90; None: as the recording states it, else unknown",
+    )
+    mounting_sigma_deg: float = Field(
+        3.0,
+        gt=0,
+        le=45,
+        description="deg, 1 sigma of every stated mounting: set by eye (judgement)",
+    )
+    heading: bool = Field(
+        True, description="trust the attitude's heading as a compass's; False: x of the world is "
+        "the vehicle's first heading"
+    )  # fmt: skip
+    declination: Literal["auto", "none"] | Annotated[float, Field(ge=-180, le=180)] = Field(
+        "auto", description="deg from true to magnetic north, east positive, that the vehicle has "
+        "not added to its heading. auto: that of the World Magnetic Model at the first position, "
+        "if the date is known; 0 if the compass's own device states positions, as ArduPilot adds "
+        "the declination by itself once it has a position, and not without one (COMPASS_AUTODEC "
+        "is 1 by default, COMPASS_DEC 0; AP_Compass.cpp, qgroundcontrol issue 143). none: unknown, "
+        "north is magnetic. A vehicle that was given COMPASS_DEC, or its position by hand, needs 0"
+    )  # fmt: skip
+    heading_sigma_deg: float = Field(
+        5.0, gt=0, le=90, description="deg, 1 sigma of the compass's constant error in a vehicle "
+        "(judgement: ArduSub's calibrated compass beside thrusters and lamps)"
+    )  # fmt: skip
+    dvl_scale_sigma: float = Field(
+        0.001, ge=0, le=0.1, description="relative, 1 sigma of a DVL's long-term accuracy: Water "
+        "Linked A50 Performance 0.1 %, Standard 1 %; speed of sound for a wrong salinity adds 1 %"
+    )  # fmt: skip
+    position_lag_sigma_s: float = Field(
+        0.3, ge=0, description="s, 1 sigma of how much older a position fix is than it states"
+    )
+    depth_change_sigma_m: Lab[float] = Field(
+        0.2, gt=0, description="m, 1 sigma of the depth around its mean, taken as constant where "
+        "positions are known and nothing measures down or depth: an AUV that follows even "
+        "ground (judgement)"
+    )  # fmt: skip
+    every_keyframes: Lab[int] = Field(
+        20, ge=1, description="keyframes after which telemetry straightens the keyframe graph"
+    )
+    boards: tuple[BoardConfig, ...] = Field(
+        (), description="markers and boards of known size that may come into view"
+    )
+    lasers: LasersConfig | None = Field(None, description="two dots of known spacing, if mounted")

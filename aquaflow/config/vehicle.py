@@ -8,13 +8,10 @@ from pydantic import Field
 
 from aquaflow.config import Config, read_yaml
 from aquaflow.config.cameras import CameraConfig
-from aquaflow.config.old_keys import understood
 from aquaflow.config.presets import merge, preset
-from aquaflow.config.recording import RecordingConfig
-from aquaflow.config.service import ServiceConfig
-from aquaflow.config.stage import validate
+from aquaflow.config.service import RecordingConfig, ServiceConfig, ViewerConfig
+from aquaflow.config.stage import understood, validate
 from aquaflow.config.telemetry import TelemetryConfig
-from aquaflow.config.viewer import ViewerConfig
 
 
 class VehicleConfig(Config):

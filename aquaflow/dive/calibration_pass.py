@@ -20,7 +20,7 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.dive.found_camera import FoundCamera, usable
 from aquaflow.geometry.camera import CameraModel, guess_camera
-from aquaflow.geometry.lens_error import TERMS
+from aquaflow.geometry.optics import TERMS
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Keypoints

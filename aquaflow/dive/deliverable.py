@@ -8,7 +8,7 @@ from __future__ import annotations
 from enum import IntEnum
 from importlib.metadata import entry_points
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.dive import Dive
 from aquaflow.slam import Slam
 

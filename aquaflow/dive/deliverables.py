@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors import InputError
 from aquaflow.dive.deliverable import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive

@@ -26,7 +26,7 @@ from aquaflow.base.storage.atomic import (
 )
 from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, DiveStatus
 from aquaflow.base.storage.dive_status import NAME as STATUS
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive import from_maps
 from aquaflow.dive.dive import CALIBRATION, FRAMES
@@ -38,8 +38,7 @@ from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
 from aquaflow.dive.tum import write_tum
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.telemetry.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS

@@ -9,7 +9,7 @@ from typing import Any
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA
+from aquaflow.geometry.optics import LENS_PRIOR_SIGMA
 from aquaflow.geometry.rectification import Rectifier
 from aquaflow.keyframes import Keyframe
 from aquaflow.tracking.calibration_check import most_turning, view_of

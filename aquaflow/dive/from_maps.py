@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.dive.utm_grid import UtmGrid
-from aquaflow.geometry.earth import latitude_longitude
+from aquaflow.geometry.alignment import latitude_longitude
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 
 Array = npt.NDArray[np.float64]

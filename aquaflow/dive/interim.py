@@ -24,8 +24,7 @@ from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.arrays import Array
-from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, quaternion_from_rotation
 from aquaflow.tracking.frame_table import CLASSES, NONE
 from aquaflow.tracking.frames import FrameClass
 

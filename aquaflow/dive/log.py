@@ -15,8 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, TextIO, TypeAlias
 
-from aquaflow.base.storage.atomic import open_to_append
-from aquaflow.base.storage.lines import is_cut_short
+from aquaflow.base.storage.atomic import is_cut_short, open_to_append
 
 LOGGERS = ("aquaflow", "py.warnings")
 """Loggers whose records go to log.jsonl."""

@@ -1,6 +1,6 @@
 """``map.aqf``: the exact map; a map that is read renders bit for bit like the one written.
 
-A file of arrays and facts (:mod:`aquaflow.base.storage.facts_file`), as
+A file of arrays and facts (:mod:`aquaflow.base.storage.archive`), as
 :mod:`aquaflow.mapping.state` serialises a map. PLY files show one choice of range or
 viewpoint; this file has the water, the light of every view and the decoder itself.
 """
@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import AquaFlowError, DamagedError, InputError, reason_of
-from aquaflow.base.storage.archive import UNREADABLE
-from aquaflow.base.storage.facts_file import read_facts_file, write_facts_file
+from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import deserialise, serialise
 from aquaflow.render.contract import Renderer

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.base.cores import usable_threads
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.profiler import Profiler
-from aquaflow.base.stages import Stages
+from aquaflow.base.stages import Profiler, Stages
+from aquaflow.base.worker import usable_threads
 from aquaflow.config import Config, SourceConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, NotMappedError, printable
-from aquaflow.base.profiler import pace
+from aquaflow.base.stages import pace
 from aquaflow.config import Config
 from aquaflow.config.mapping import InsertionConfig, OptimiserConfig
 from aquaflow.config.stage import StageConfig

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.earth import latitude_longitude
+from aquaflow.geometry.alignment import latitude_longitude
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 
 Array = npt.NDArray[np.float64]

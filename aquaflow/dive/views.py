@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 
 if TYPE_CHECKING:
     from aquaflow.dive.run import DiveRun

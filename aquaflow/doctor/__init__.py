@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.doctor import accelerator, computer, devices, packages
+from aquaflow.doctor import computer, devices
+from aquaflow.doctor import machine as accelerator
 from aquaflow.doctor.machine import CheckResult, MachineProbes
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def examine(machine: MachineProbes | None = None) -> list[CheckResult]:
     )
     tried = accelerator.findings(machine)  # first: it times what the first use has to compile
     found = [probe(machine) for probe in probes]
-    return [*found, *tried, *packages.findings(machine)]
+    return [*found, *tried, *computer.findings(machine)]
 
 
 def to_json(findings: list[CheckResult]) -> dict[str, Any]:

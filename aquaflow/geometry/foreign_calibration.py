@@ -15,7 +15,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from aquaflow.base.errors import ConfigError, InputError, reason_of
-from aquaflow.base.errors.plain_yaml import MOST_BYTES
+from aquaflow.base.errors.regular_file import MOST_BYTES
 
 Values = dict[str, Any]
 

@@ -10,8 +10,12 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.distortion import undistort_points
-from aquaflow.geometry.optics import pixels_of_points, points_at_depth, virtual_centre
+from aquaflow.geometry.optics import (
+    pixels_of_points,
+    points_at_depth,
+    undistort_points,
+    virtual_centre,
+)
 
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]

@@ -1,6 +1,6 @@
 """Keyframes and their fused pointmaps: what tracking and mapping share."""
 
-from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE, LearnedDepths, Pointmap
+from aquaflow.keyframes.place import UNKNOWN_VARIANCE, LearnedDepths, Pointmap
 from aquaflow.keyframes.store import RESIDENT_KEYFRAMES, Keyframe, KeyframeStore
 
 __all__ = [

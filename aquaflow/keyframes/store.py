@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.array_file import Arrays
+from aquaflow.base.storage.archive import Arrays
 from aquaflow.base.storage.spill import Spill
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.pointmap import LearnedDepths, Pointmap
+from aquaflow.keyframes.place import LearnedDepths, Pointmap
 from aquaflow.prior.contract import Encoding, Prior
 
 Array = npt.NDArray[np.float64]

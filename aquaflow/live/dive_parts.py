@@ -6,13 +6,12 @@ import logging
 from dataclasses import dataclass
 from functools import partial
 
-from aquaflow.base.cores import core_count
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.stages import Stages
 from aquaflow.base.storage.dive_status import DiveStatus, read_status
-from aquaflow.base.worker import Worker
+from aquaflow.base.worker import Worker, core_count
 from aquaflow.config import Config, parse_config
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.loop import LiveLoop
 from aquaflow.sources.wall_clock import OLDEST_NS

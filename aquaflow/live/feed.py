@@ -27,7 +27,7 @@ from typing import Protocol, runtime_checkable
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import SourceConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples

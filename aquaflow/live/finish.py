@@ -10,8 +10,8 @@ from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, read_status, refuse_unfinished
-from aquaflow.base.storage.folder_lock import refuse_held
-from aquaflow.config.device import MountingConfig
+from aquaflow.base.storage.whole_folder import refuse_held
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import MARKER, WORK

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Profiler
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters

@@ -7,9 +7,9 @@ import shutil
 import sys
 from functools import partial
 
-from aquaflow.base.cores import usable_threads
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState
+from aquaflow.base.worker import usable_threads
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.half_size import halve

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aquaflow.config import Config
-from aquaflow.config.device import MountingConfig
 from aquaflow.config.service import ServiceConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.sources import CameraSource, mounting_of

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.base.signals import stop_on_signals
 from aquaflow.base.storage.dive_status import DiveState, read_status
+from aquaflow.base.worker import stop_on_signals
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.run import Finished
 from aquaflow.live.checkpoint.checkpoint import UnusableStateError

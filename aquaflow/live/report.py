@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from aquaflow import __version__
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.in_site import in_site_numbers
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Profiler
 from aquaflow.config import Config
 from aquaflow.geometry.arrays import (
     Arrays,

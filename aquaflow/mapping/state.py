@@ -18,7 +18,7 @@ from torch import Tensor
 from aquaflow.base.errors import DamagedError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
-from aquaflow.config.old_keys import without_old_keys
+from aquaflow.config.stage import without_old_keys
 from aquaflow.geometry.arrays import (
     Arrays,
     add_prefix,

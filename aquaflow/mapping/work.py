@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Profiler
 from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.cores import core_count
+from aquaflow.base.worker import core_count
 from aquaflow.config.prior import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.classical import ClassicalPrior

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from aquaflow.config.can_devices import Nmea2000Config
+from aquaflow.config.instruments import Nmea2000Config
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.drivers.transport.can import EXTENDED, RECORD

@@ -20,9 +20,8 @@ from pathlib import Path
 from pydantic import Field
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.base.errors.plain_yaml import read_mapping
-from aquaflow.config.device import MountingConfig
-from aquaflow.config.stage import StageConfig, validate
+from aquaflow.base.errors.regular_file import read_mapping
+from aquaflow.config.stage import MountingConfig, StageConfig, validate
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.recordings.telemetry_log import ByteLog
 from aquaflow.sources import (

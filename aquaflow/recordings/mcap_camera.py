@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, printable
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.camera import (
     CameraModel,
     camera_of_values,

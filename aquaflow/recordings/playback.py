@@ -10,7 +10,7 @@ from itertools import chain, dropwhile
 from typing import TypeAlias
 
 from aquaflow.base.errors.failures import Failures
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.types import Dropped, Frame, TelemetrySample
 

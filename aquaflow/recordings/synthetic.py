@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.base.errors.plain_yaml import read_mapping
-from aquaflow.config.device import MountingConfig
+from aquaflow.base.errors.regular_file import read_mapping
+from aquaflow.config.stage import MountingConfig
 from aquaflow.recordings.images import SUBFOLDER, ImageFolder
 
 MARK = "synth.yaml"

@@ -13,8 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from aquaflow.base.errors.regular_file import open_regular
-from aquaflow.base.storage.atomic import open_to_append
-from aquaflow.base.storage.lines import is_cut_short
+from aquaflow.base.storage.atomic import is_cut_short, open_to_append
 from aquaflow.recordings.telemetry_json import sample_from_values, sample_to_json
 from aquaflow.types import KIND_OF, TelemetrySample
 

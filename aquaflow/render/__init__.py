@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Literal
 
-from aquaflow.base.cores import core_count
+from aquaflow.base.worker import core_count
 
 if TYPE_CHECKING:
     from aquaflow.render.contract import Renderer

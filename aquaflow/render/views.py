@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from aquaflow.base.storage.array_file import Arrays
+from aquaflow.base.storage.archive import Arrays
 from aquaflow.base.storage.spill import Spill
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp

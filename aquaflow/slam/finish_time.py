@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 
-from aquaflow.base.clocks.deadline import Deadline, Now
+from aquaflow.base.clocks.wall import Deadline, Now
 
 SETTLED, REFINED, EVALUATED = 0.25, 0.55, 0.80
 """Shares of the whole after which a phase ends (notes/2026-11-speed.md#finishing)."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors import ConfigError
 from aquaflow.base.stages import Stages
 from aquaflow.base.worker import Worker

@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import CameraConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.device import MountingConfig
-from aquaflow.geometry.earth import north_east
+from aquaflow.config.stage import MountingConfig
+from aquaflow.geometry.alignment import north_east
 from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.directions import orient

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath

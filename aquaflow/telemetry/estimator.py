@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.telemetry.building import problem_of
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.confirmation import confirmation_of

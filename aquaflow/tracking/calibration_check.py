@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import fdtrc
 
-from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
+from aquaflow.geometry.optics import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.keyframes import Keyframe
 from aquaflow.tracking.lens_adjustment import adjust_lens, clusters_of, model_error
 from aquaflow.tracking.lens_equations import Array, LensObservations

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aquaflow.geometry.lens_error import TERMS
+from aquaflow.geometry.optics import TERMS
 from aquaflow.optimise.least_squares import Rules, minimise
 from aquaflow.optimise.robust import sigma_of_lengths
 from aquaflow.tracking.lens_equations import (

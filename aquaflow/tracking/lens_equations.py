@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.lens_error import (
+from aquaflow.geometry.optics import (
     LENS_PRIOR_SIGMA,
     TERMS,
     by_lens,

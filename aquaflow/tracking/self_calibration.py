@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.lens_error import TERMS
+from aquaflow.geometry.optics import TERMS
 from aquaflow.tracking.lens_adjustment import LensAdjustment, adjust_lens, model_error
 from aquaflow.tracking.lens_equations import Array, LensObservations
 from aquaflow.tracking.lens_matches import LensView, match_pixels

@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding, Prior

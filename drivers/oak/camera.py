@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.drivers.capture import RawPicture, UnusablePictureError
 from aquaflow.drivers.events import about
 from aquaflow.drivers.live import LiveCamera

@@ -10,7 +10,7 @@ from typing import Any
 
 from aquaflow.base.errors import ConfigError, reason_of
 from aquaflow.base.errors.extra import load
-from aquaflow.config.can_devices import DbcConfig, DbcSignal
+from aquaflow.config.instruments import DbcConfig, DbcSignal
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.packets import PacketDecoder

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from aquaflow.config.can_devices import Nmea2000Config
+from aquaflow.config.instruments import Nmea2000Config
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.packets import PacketDecoder

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.config.device import Assumptions
+from aquaflow.config.stage import Assumptions
 from aquaflow.drivers.rotation import from_euler
 from aquaflow.types import AngularRate, Attitude, TelemetrySample, Velocity
 

@@ -6,7 +6,7 @@ import math
 import struct
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.config.can_devices import DbcSignal
+from aquaflow.config.instruments import DbcSignal
 from aquaflow.sim_drivers.devices.device import OneWayDevice
 from aquaflow.sim_drivers.devices.waterlinked import euler_deg
 from aquaflow.types import (

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.profiler import Profiler
-from aquaflow.base.stages import Stages
+from aquaflow.base.stages import Profiler, Stages
 
 
 @pytest.fixture

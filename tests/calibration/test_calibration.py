@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.calibration.board import Board, BoardKind, Detector, draw, write_board
+from aquaflow.calibration.board import LEAST_VIEWS, Board, BoardKind, Detector, draw, write_board
 from aquaflow.calibration.calibrate import calibrate, write_calibration
-from aquaflow.calibration.views import LEAST_VIEWS
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.port import FlatPort
 from tests.calibration.board_pictures import Image, pictures, taken

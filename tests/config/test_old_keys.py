@@ -12,10 +12,16 @@ import yaml
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.config import Config, MappingConfig, load_config
-from aquaflow.config.old_keys import CONSTANTS, GONE, without_old_keys
 from aquaflow.config.presets import PRESETS, load_configured
 from aquaflow.config.service import ServiceConfig
-from aquaflow.config.stage import StageConfig, stages_of, validate
+from aquaflow.config.stage import (
+    CONSTANTS,
+    GONE,
+    StageConfig,
+    stages_of,
+    validate,
+    without_old_keys,
+)
 from aquaflow.config.vehicle import VehicleConfig, load_any, load_vehicle
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import deserialise, serialise

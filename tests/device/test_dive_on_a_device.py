@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from aquaflow.api.map import load_map
-from aquaflow.base.storage.facts_file import read_facts_file
+from aquaflow.base.storage.archive import read_facts_file
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.map_file import read_map_file
 from aquaflow.dive.ply import read_ply

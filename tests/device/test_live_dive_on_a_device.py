@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.config.service import ViewerConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.config.viewer import ViewerConfig
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.health.degradation import DegradationLevel

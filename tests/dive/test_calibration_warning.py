@@ -13,8 +13,7 @@ import pytest
 
 from aquaflow.config import Config
 from aquaflow.dive import replay, run
-from aquaflow.geometry.camera import load_camera
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import load_camera, save_camera
 from aquaflow.keyframes import Keyframe
 from aquaflow.sources import open_recording
 from tests.command_line import Cli

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.facts_file import FACTS
+from aquaflow.base.storage.archive import FACTS
 from aquaflow.dive.map_file import read_map_file, write_map_file
 from aquaflow.mapping.mapper import Mapper
 from tests.mapping.mapping_scenes import (

@@ -9,7 +9,8 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from aquaflow.doctor import CheckResult, MachineProbes, accelerator, print_findings, to_json
+from aquaflow.doctor import CheckResult, MachineProbes, print_findings, to_json
+from aquaflow.doctor import machine as accelerator
 from aquaflow.doctor.attempts import Attempt
 from aquaflow.render.gpu import Gpu
 

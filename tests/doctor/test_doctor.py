@@ -14,9 +14,8 @@ from rich.console import Console
 
 from aquaflow.doctor import CheckResult, MachineProbes, examine, print_findings, to_json
 from aquaflow.doctor.attempts import Attempt
-from aquaflow.doctor.computer import isa_level
+from aquaflow.doctor.computer import PACKAGES, isa_level
 from aquaflow.doctor.machine import renderer_name
-from aquaflow.doctor.packages import PACKAGES
 
 V4 = "avx512f avx512bw avx512cd avx512dq avx512vl"
 CPUINFO = f"processor\t: 0\nmodel name\t: Test CPU\nflags\t\t: fpu {V4}\nprocessor\t: 1\n"

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from aquaflow.doctor import MachineProbes
-from aquaflow.doctor.packages import INSTALLED_OTHERWISE, OTHER_BUILDS, PACKAGES, findings
+from aquaflow.doctor.computer import INSTALLED_OTHERWISE, OTHER_BUILDS, PACKAGES, findings
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -82,7 +82,7 @@ def test_what_is_installed_here_is_found_by_its_module() -> None:
 
 def test_nothing_heavy_is_imported() -> None:
     program = (
-        "import sys; from aquaflow.doctor.packages import findings; "
+        "import sys; from aquaflow.doctor.computer import findings; "
         "from aquaflow.doctor import MachineProbes; findings(MachineProbes()); "
         f"print([name for name in {HEAVY!r} if name in sys.modules])"
     )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.config.can_devices import DbcSignal
+from aquaflow.config.instruments import DbcSignal
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import TelemetryConfig, parse_telemetry
 from aquaflow.drivers.link import LinkCounters

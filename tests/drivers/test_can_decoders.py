@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.config.can_devices import DbcConfig, Nmea2000Config
+from aquaflow.config.instruments import DbcConfig, Nmea2000Config
 from aquaflow.drivers.protocol.dbc import DbcDecoder
 from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD

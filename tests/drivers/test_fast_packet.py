@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from aquaflow.config.can_devices import Nmea2000Config
+from aquaflow.config.instruments import Nmea2000Config
 from aquaflow.drivers.protocol.nmea2000 import FastPackets, Nmea2000Decoder
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
 from aquaflow.types import Position, TelemetrySample, UtcTime

@@ -15,8 +15,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.drivers.capture import Capture, RawPicture
 from aquaflow.drivers.live import CameraState, LiveCamera
-from aquaflow.geometry.camera import guess_camera
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.types import CameraModel, Dropped, Frame
 from tests.drivers.camera_scenes import QUICK, closing, settled
 

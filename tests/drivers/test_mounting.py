@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.drivers import rotation
 from aquaflow.drivers.mounting import BodyFrame, Mounting
 from aquaflow.drivers.plausible import plausible

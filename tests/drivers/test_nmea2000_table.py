@@ -10,7 +10,7 @@ import random
 
 import pytest
 
-from aquaflow.config.can_devices import Nmea2000Config
+from aquaflow.config.instruments import Nmea2000Config
 from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
 from aquaflow.types import Position, UtcTime

@@ -20,10 +20,9 @@ from aquaflow.geometry.camera import (
     guess_camera,
     has_unmeasured_port,
     load_camera,
+    save_camera,
 )
-from aquaflow.geometry.camera_file import save_camera
-from aquaflow.geometry.port import DomePort, FlatPort, Port
-from aquaflow.geometry.water_index import FRESH_WATER, SEA_WATER, water_index
+from aquaflow.geometry.port import FRESH_WATER, SEA_WATER, DomePort, FlatPort, Port, water_index
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 CALIBRATIONS = sorted(SHARED.glob("*/camera.yaml"))

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.geometry.epipolar import epipolar_distances
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.geometry.two_view import epipolar_distances
 
 
 def two_views(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, Sim3]:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.geometry.camera_file import save_for_others
+from aquaflow.geometry.camera import CameraModel, load_camera, save_for_others
 
 D = (-0.3, 0.1, 0.001, -0.002, 0.02)
 

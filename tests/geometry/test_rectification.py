@@ -11,8 +11,7 @@ import pytest
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel, DistortionModel
-from aquaflow.geometry.distortion import undistort_points
-from aquaflow.geometry.optics import pixels_of_points
+from aquaflow.geometry.optics import pixels_of_points, undistort_points
 from aquaflow.geometry.port import DomePort, FlatPort
 from aquaflow.geometry.rectification import Rectifier
 

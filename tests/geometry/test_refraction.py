@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aquaflow.geometry.optics import rays_in_water, rays_to_points, refract
 from aquaflow.geometry.port import DomePort, FlatPort, Port
-from aquaflow.geometry.refraction import rays_in_water, rays_to_points, refract
 
 Array = npt.NDArray[np.float64]
 

@@ -6,8 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch, right_jacobian_inverse
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, right_jacobian_inverse
 
 Array = npt.NDArray[np.float64]
 COUNT = 40

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.geometry.triangulation import Triangulation, triangulate
+from aquaflow.geometry.two_view import Triangulation, triangulate
 
 Array = npt.NDArray[np.float64]
 

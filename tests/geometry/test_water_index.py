@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aquaflow.geometry.water_index import FRESH_WATER, SEA_WATER, water_index
+from aquaflow.geometry.port import FRESH_WATER, SEA_WATER, water_index
 
 
 @pytest.mark.parametrize(

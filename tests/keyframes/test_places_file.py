@@ -15,13 +15,13 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import (
     LARGEST_ROOT,
     LEVELS,
+    UNKNOWN_VARIANCE,
     KeyframePlace,
     KeypointDepths,
     pack,
     unpack,
 )
 from aquaflow.keyframes.places_file import EDGE, NAME, PlacesFile, Rows, write_places
-from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE
 from aquaflow.prior.contract import Keypoints
 
 CAMERA = CameraModel(160, 120, 130.0, 131.0, 80.5, 60.0)

@@ -12,8 +12,8 @@ from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.worker import Worker
 from aquaflow.config import Config, parse_config
-from aquaflow.config.device import MountingConfig
 from aquaflow.config.service import ServiceConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
 from aquaflow.lab.evaluation.trajectory import read_tum

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.live_dive import LiveDive

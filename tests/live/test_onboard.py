@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from aquaflow.base.errors import AquaFlowError, InputError
-from aquaflow.base.signals import stop_on_signals
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
+from aquaflow.base.worker import stop_on_signals
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live import onboard as module
 from aquaflow.live.clock_reading import ClockReading

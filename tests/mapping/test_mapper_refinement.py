@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.optimisation.schedule import Rates, refining_rates

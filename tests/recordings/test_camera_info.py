@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import CameraModel, load_camera, save_camera
 from aquaflow.recordings.camera_info import camera_of_info, choose_topic, info_topic, is_rectified
 
 

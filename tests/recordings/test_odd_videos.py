@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.geometry.camera import guess_camera
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.recordings import video_decoder
 from aquaflow.recordings.video import VideoFile
 from aquaflow.types import Dropped, Frame

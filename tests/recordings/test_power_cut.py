@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.recorder import Recorder
 from aquaflow.recordings.mcap_camera import McapCamera

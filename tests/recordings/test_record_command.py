@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.recorder import Recorder

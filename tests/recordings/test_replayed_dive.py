@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.live.recorder import Recorder
 from aquaflow.recordings.mcap_telemetry import McapTelemetry
 from aquaflow.sources import mounting_of, open_recorded_telemetry, open_recording

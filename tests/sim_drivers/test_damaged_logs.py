@@ -12,7 +12,7 @@ import pytest
 from mcap.writer import Writer
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.lab.synthetic.telemetry import HEADER
 from aquaflow.live.recorder.pictures import encode
 from aquaflow.recordings.csv_telemetry import CsvTelemetry

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.geometry.camera import guess_camera
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.recordings.images import ImageFolder
 from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.types import Dropped, Frame

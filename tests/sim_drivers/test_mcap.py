@@ -19,7 +19,7 @@ from mcap.writer import Writer
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.link import SerialConfig
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.recorder import Recorder

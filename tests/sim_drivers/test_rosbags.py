@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.live.recorder.pictures import encode
 from aquaflow.recordings.rosbag import messages_in
 from aquaflow.recordings.rosbag_camera import RosbagCamera

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import SerialConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.recordings.candump import Candump
 from aquaflow.recordings.csv_telemetry import CsvTelemetry

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.geometry.camera import guess_camera
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.recordings import video
 from aquaflow.recordings.picture import UnreadablePictureError
 from aquaflow.recordings.video import VideoFile

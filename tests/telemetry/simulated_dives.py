@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
 from aquaflow.lab.synthetic import SimulatedDive, SyntheticConfig, simulate

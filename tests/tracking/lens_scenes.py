@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.lens_error import rays_of, seen_at
+from aquaflow.geometry.optics import rays_of, seen_at
 from aquaflow.geometry.similarity import so3_exp
 from aquaflow.tracking.lens_equations import LensObservations
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.camera import CameraModel, guess_camera
-from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA
+from aquaflow.geometry.optics import LENS_PRIOR_SIGMA
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints
 from aquaflow.tracking.lens_matches import MIN_PAIR_MATCHES, LensView, match_pixels

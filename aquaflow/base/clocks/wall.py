@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
+import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 log = logging.getLogger(__name__)
 
@@ -50,3 +54,103 @@ class WallClockWatch:
                 extra={"fields": {"event": "clock", "source": "computer"}},
             )  # fmt: skip
         return WallClockReading(monotonic, offset, change)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Whether the computer's clock can be believed: a board without a battery wakes up in the past.
+
+SYNCHRONISED = Path("run/systemd/timesync/synchronized")
+"""systemd-timesyncd(8) makes it when it first hears a time server after a boot."""
+BATTERY_CLOCKS = "sys/class/rtc/rtc*/since_epoch"
+"""Clocks with a battery of their own, in seconds since 1970 (Documentation/admin-guide/rtc.rst)."""
+AGREE_S = 60.0
+"""The kernel takes its time from such a clock at the boot, in whole seconds, and writes it back
+every 11 minutes; one that differs by more did not set this clock."""
+TIME_ERROR = 5
+"""What adjtimex(2) returns while nothing has synchronised the kernel's clock."""
+TIMEX_BYTES = 512
+"""More than a struct timex has (208 on 64-bit systems); zeros ask without changing anything."""
+
+
+def clock_is_set(root: Path = Path("/"), now_s: Callable[[], float] = time.time) -> bool:
+    """True if the wall clock was set since the machine was started: by a time server or GNSS, or
+    by a clock with a battery that it agrees with."""
+    if (root / SYNCHRONISED).exists():
+        return True
+    found = (_seconds(clock) for clock in root.glob(BATTERY_CLOCKS))
+    if any(seconds is not None and abs(seconds - now_s()) <= AGREE_S for seconds in found):
+        return True
+    return root == Path("/") and kernel_is_synchronised()
+
+
+def kernel_is_synchronised() -> bool:
+    """As adjtimex(2) says; False where a sandbox forbids to ask."""
+    try:
+        answer = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
+    except (AttributeError, OSError):
+        return False
+    return 0 <= int(answer) < TIME_ERROR
+
+
+def _seconds(clock: Path) -> int | None:
+    try:
+        return int(clock.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+# --- ----------------------------------------------------------------------------------------------
+# A moment after which optional work is left out.
+
+Now = Callable[[], float]
+"""Seconds on a clock that is never set."""
+
+
+class Deadline:
+    """Work may go on until ``seconds`` have passed; None: for ever."""
+
+    def __init__(
+        self,
+        seconds: float | None = None,
+        now_s: Now = time.monotonic,
+        cut_s: Now = lambda: math.inf,
+    ) -> None:
+        """``cut_s``: the moment at which it ends at the latest, which may come nearer later."""
+        self._now_s, self._cut_s, self._seconds = now_s, cut_s, seconds
+        self._asked_s = math.inf if seconds is None else now_s() + seconds
+
+    @property
+    def _end_s(self) -> float:
+        return min(self._asked_s, self._cut_s())
+
+    @property
+    def left_s(self) -> float:
+        """Seconds that are left; 0 once it is over."""
+        return max(self._end_s - self._now_s(), 0.0)
+
+    @property
+    def over(self) -> bool:
+        """True once no time is left."""
+        return self._now_s() >= self._end_s
+
+    @property
+    def passed(self) -> float:
+        """The share of the time that has passed, 1 once it is over; 0 where it has no end."""
+        if not self._seconds:
+            return 0.0 if self._seconds is None else 1.0
+        return min(max(1.0 - (self._end_s - self._now_s()) / self._seconds, 0.0), 1.0)
+
+    @property
+    def limited(self) -> bool:
+        """False if there is time for ever."""
+        return math.isfinite(self._end_s)
+
+    def within(self, most_s: float | None) -> Deadline:
+        """The earlier of this one and ``most_s`` from now; None: this one."""
+        limits = [] if most_s is None else [most_s]
+        limits += [self.left_s] if self.limited else []
+        return Deadline(min(limits, default=None), self._now_s, self._cut_s)
+
+    def share(self, part: float) -> Deadline:
+        """One after ``part`` of the time that is left."""
+        return self.within(part * self.left_s if self.limited else None)

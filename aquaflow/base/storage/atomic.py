@@ -12,18 +12,22 @@ import errno
 import fcntl
 import io
 import json
+import math
 import os
 import re
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+import numpy.typing as npt
 import yaml
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.errors.regular_file import LINK, SPECIAL
+from aquaflow.base.errors.regular_file import LINK, SPECIAL, open_regular
 
 _PART = re.compile(r"\.[0-9a-f]{32}\.part(\.\w+)?")
 _CLEARED: set[tuple[int, int]] = set()
@@ -222,3 +226,45 @@ def write_yaml(path: Path, data: dict[str, Any], comment: str = "") -> None:
     text = head + yaml.safe_dump(_plain(data), sort_keys=False, allow_unicode=False)
     with atomic_write(path) as stream:
         stream.write(text.encode("utf-8"))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Arrays in files without a name, for what a command needs while it runs beyond its memory.
+
+
+def scratch_array(folder: Path, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """An array in a file of ``folder``, which is made if needed; the file ends with the array.
+
+    Its room is taken at once: a disk that fills up later would end the process.
+
+    Raises:
+        InputError: the file cannot be made.
+    """
+    size = max(1, math.prod(shape)) * np.dtype(dtype).itemsize
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as stream:
+            os.posix_fallocate(stream.fileno(), 0, size)
+            flat: np.memmap[Any, Any] = np.memmap(
+                stream, dtype, "r+", shape=(max(1, math.prod(shape)),)
+            )
+    except OSError as error:
+        raise InputError(
+            f"cannot write to {folder}: {error.strerror or error}; give a folder with room that "
+            "can be written to"
+        ) from error
+    return flat[: math.prod(shape)].reshape(shape)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Files of lines that are appended to, also after a power cut in the middle of a line.
+
+
+def is_cut_short(path: Path) -> bool:
+    """True if the file's last line has no end."""
+    try:
+        with open_regular(path) as stream:
+            stream.seek(-1, os.SEEK_END)
+            return stream.read(1) != b"\n"
+    except OSError:  # there is none, or it is empty
+        return False

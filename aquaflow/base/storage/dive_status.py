@@ -11,7 +11,7 @@ from pathlib import Path
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
-from aquaflow.base.storage.folder_lock import is_held
+from aquaflow.base.storage.whole_folder import is_held
 
 NAME = "dive.json"
 FRAMES, METRICS, MAP = "frames.csv", "metrics.json", "map.aqf"

@@ -16,8 +16,7 @@ from types import TracebackType
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
-from aquaflow.base.storage.folder_lock import FolderLock
-from aquaflow.base.storage.whole_folder import remove_abandoned
+from aquaflow.base.storage.whole_folder import FolderLock, remove_abandoned
 from aquaflow.config import Config
 from aquaflow.config.batch import BatchConfig
 from aquaflow.lab.batch.job import WRITTEN, BatchJob

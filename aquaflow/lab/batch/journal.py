@@ -11,8 +11,7 @@ from typing import Any
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
-from aquaflow.base.storage.atomic import open_to_append
-from aquaflow.base.storage.lines import is_cut_short
+from aquaflow.base.storage.atomic import is_cut_short, open_to_append
 
 JOURNAL = "batch.jsonl"
 

@@ -21,9 +21,8 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.epipolar import epipolar_distances
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.two_view import MIN_MATCHES, relative_pose
+from aquaflow.geometry.two_view import MIN_MATCHES, epipolar_distances, relative_pose
 from aquaflow.lab.evaluation.dive_files import evaluated_dive
 from aquaflow.lab.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.lab.evaluation.truth import read_truth

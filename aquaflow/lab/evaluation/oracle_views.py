@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.source import SourceConfig
+from aquaflow.config.cameras import SourceConfig
 from aquaflow.dive.dive import MAP, Dive
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
-from aquaflow.geometry.epipolar import epipolar_distances
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.two_view import relative_pose
+from aquaflow.geometry.two_view import epipolar_distances, relative_pose
 from aquaflow.lab.evaluation.matching import WITHIN_PX
 from aquaflow.lab.prior_bench.pair import FoundMatches, KnownPair
 from aquaflow.prior.contract import Float

@@ -8,8 +8,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
-from aquaflow.geometry.triangulation import triangulate
-from aquaflow.geometry.two_view import relative_pose
+from aquaflow.geometry.two_view import relative_pose, triangulate
 from aquaflow.lab.stress.case import Check, case
 from aquaflow.lab.stress.swim import CAMERA, pose
 from aquaflow.prior.homography import flow_of_homography

@@ -6,7 +6,7 @@ from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from aquaflow.geometry.port_file import PortFile
+from aquaflow.geometry.port import PortFile
 from aquaflow.lab.synthetic.planted_config import Bleached, PlantedObject
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 

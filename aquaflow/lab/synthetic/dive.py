@@ -15,7 +15,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.geometry.camera_file import save_camera
+from aquaflow.geometry.camera import save_camera
 from aquaflow.lab.synthetic import objects, radiance, render
 from aquaflow.lab.synthetic import path as paths
 from aquaflow.lab.synthetic.bodies import Bodies

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.lab.synthetic.config import FACED, SyntheticConfig
 from aquaflow.lab.synthetic.streams import stream
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import rays_of_pixels
-from aquaflow.geometry.port_file import port_of
+from aquaflow.geometry.port import port_of
 from aquaflow.lab.synthetic import objects, pool
 from aquaflow.lab.synthetic import path as paths
 from aquaflow.lab.synthetic.config import SyntheticConfig

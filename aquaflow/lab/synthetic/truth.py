@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import AquaFlowError, InputError, reason_of
-from aquaflow.base.errors.plain_yaml import read_mapping
+from aquaflow.base.errors.regular_file import read_mapping
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.water import Medium, load_medium

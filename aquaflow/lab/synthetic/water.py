@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.base.errors.plain_yaml import read_mapping
+from aquaflow.base.errors.regular_file import read_mapping
 from aquaflow.dive.medium import Medium, Rgb
 from aquaflow.lab.synthetic.config import WaterType
 

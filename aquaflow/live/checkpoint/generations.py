@@ -14,10 +14,14 @@ from typing import Any
 
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.archive import UNREADABLE, open_archive
+from aquaflow.base.storage.archive import (
+    UNREADABLE,
+    open_archive,
+    read_facts_file,
+    write_facts_file,
+)
 from aquaflow.base.storage.atomic import make_subfolder
 from aquaflow.base.storage.dive_status import CHECKPOINT
-from aquaflow.base.storage.facts_file import read_facts_file, write_facts_file
 from aquaflow.geometry.arrays import Arrays
 from aquaflow.live.clock_reading import ClockReading
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.folder_lock import refuse_held
 from aquaflow.base.storage.spill import SUFFIX, read_item
+from aquaflow.base.storage.whole_folder import refuse_held
 from aquaflow.config import Config
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import FrameRow, or_lost, readable_rows

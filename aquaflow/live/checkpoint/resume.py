@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.base.clocks.computer import clock_is_set
+from aquaflow.base.clocks.wall import clock_is_set
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, read_status
 from aquaflow.base.storage.dive_status import NAME as STATUS
-from aquaflow.base.storage.folder_lock import is_held
+from aquaflow.base.storage.whole_folder import is_held
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import header

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Profiler
 
 LAGS = 600
 """Frames whose lag is remembered: a minute at ten a second."""

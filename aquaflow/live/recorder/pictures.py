@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
 from aquaflow.types import CameraModel, EncodedPicture, Frame
 
 FOXGLOVE_DISTORTION = {"none": "", "radtan": "plumb_bob", "fisheye": "kannala_brandt"}

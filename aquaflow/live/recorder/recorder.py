@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.device import MountingConfig
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.live.recorder.disk import free_bytes
 from aquaflow.live.recorder.status import RecorderStatus
 from aquaflow.live.recorder.write_queue import (

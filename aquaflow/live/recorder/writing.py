@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from aquaflow import __version__
 from aquaflow.base.clocks.wall import WallClockWatch
-from aquaflow.config.device import MountingConfig
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.live.recorder.pictures import (
     calibration_message,
     camera_to_json,

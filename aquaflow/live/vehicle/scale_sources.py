@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.config.can_devices import DbcConfig
+from aquaflow.config.instruments import DbcConfig
 from aquaflow.config.telemetry import AnyDevice, MavlinkConfig
 from aquaflow.config.vehicle import VehicleConfig
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from aquaflow.geometry.similarity import Sim3, on_so3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, on_so3
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.render.transfers import moves_in
 from aquaflow.render.views import View

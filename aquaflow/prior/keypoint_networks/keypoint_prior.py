@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.prior import flow as dense
 from aquaflow.prior.candidates import from_homography, from_prediction
 from aquaflow.prior.contract import Encoding, Float, Keypoints, Mask

@@ -1,5 +1,5 @@
 // Two-view depths of every matched pixel, fused into a keyframe's pointmap. What each line does and
-// why is in aquaflow/geometry/triangulation.py and aquaflow/tracking/pose/depth_fusion.py, whose
+// why is in aquaflow/geometry/two_view.py and aquaflow/tracking/pose/depth_fusion.py, whose
 // constants come in; the names are theirs. In single precision: its rounding, some 1e-4 of a depth
 // where the parallax is least, is a hundredth of what no measurement is trusted beyond.
 #pragma once

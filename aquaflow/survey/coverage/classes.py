@@ -7,7 +7,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.survey.coverage.raster import RANGE_BINS, GridFrame
 from aquaflow.survey.coverage.tiles import Counts, Sides
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.keyframes.pointmap import Pointmap
+from aquaflow.keyframes.place import Pointmap
 
 Array = npt.NDArray[np.float64]
 

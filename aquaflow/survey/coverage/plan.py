@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.classes import Classes, CoverageClass, classify, near_bins
 from aquaflow.survey.coverage.layer import CoverageLayer

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.survey.coverage.footprint import Footprint
 from aquaflow.survey.coverage.layer import CoverageLayer, Sight
 from aquaflow.survey.coverage.raster import GridFrame

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.base.storage.table import csv_text
+from aquaflow.base.storage.spill import csv_text
 from aquaflow.survey.measure.reef_numbers import ReefNumbers
 
 JSON, CSV = "reef_numbers.json", "reef_numbers.csv"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.survey.site.manifest import NAME, SiteDive, add_dives
 from aquaflow.survey.site.site_log import say
 

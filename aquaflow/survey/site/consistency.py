@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import GraphConfig
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.loop_admission import Chains, gap_chi2
 

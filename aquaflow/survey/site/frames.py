@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.dive.dive import Dive
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.telemetry.world_frame import WorldFrame
 
 

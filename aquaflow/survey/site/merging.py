@@ -18,7 +18,7 @@ import numpy as np
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import make_subfolder, write_json
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.places_file import PlacesFile

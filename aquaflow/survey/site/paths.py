@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.tum import Trajectory
-from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, quaternion_from_rotation
 
 Array = npt.NDArray[np.float64]
 

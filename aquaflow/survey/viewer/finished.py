@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.storage.dive_status import unfinished_reason
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import CAMERA, FRAMES, TRAJECTORY, Dive
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.levels import Palette
 from aquaflow.survey.viewer.measuring import LengthUnit

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.survey.viewer.client import ClientFile, client_file
 from aquaflow.survey.viewer.viewer_content import ViewerContent
 from aquaflow.web import HttpRequest, HttpResponse, WebServer

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.errors import InputError, printable
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, read_ply
 from aquaflow.geometry.similarity import Sim3

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.known_lengths import BoardConfig, CharucoConfig, MarkersConfig
+from aquaflow.config.telemetry import BoardConfig, CharucoConfig, MarkersConfig
 
 Array = npt.NDArray[np.float64]
 

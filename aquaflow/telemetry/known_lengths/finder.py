@@ -9,7 +9,7 @@ from copy import copy
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.fusion import FusionConfig
+from aquaflow.config.telemetry import FusionConfig
 from aquaflow.telemetry.known_lengths.board_size import BoardView, board_lengths
 from aquaflow.telemetry.known_lengths.boards import BoardDetector, BoardSighting
 from aquaflow.telemetry.known_lengths.known_length import KnownLength

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.known_lengths import LasersConfig
+from aquaflow.config.telemetry import LasersConfig
 from aquaflow.telemetry.known_lengths.board_size import BoardView
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.known_lengths.laser_dots import DotCandidates

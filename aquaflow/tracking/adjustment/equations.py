@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.similarity import hat
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch, hat
 from aquaflow.optimise.robust import HUBER_LENGTH, Huber
 
 Array = npt.NDArray[np.float64]

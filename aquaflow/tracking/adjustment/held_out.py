@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch
 from aquaflow.tracking.adjustment.equations import (
     KERNEL,
     AnchorMatches,

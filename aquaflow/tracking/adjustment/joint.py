@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch
 from aquaflow.optimise.robust import sigma_of_lengths
 from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, project
 from aquaflow.tracking.adjustment.held_out import HeldOutVerdict, only, triangulate, verdict

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aquaflow.geometry.similarity_batch import Sim3Batch, right_jacobian_inverse
+from aquaflow.geometry.similarity import Sim3Batch, right_jacobian_inverse
 from aquaflow.tracking.adjustment.equations import Array, Index
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch
 from aquaflow.tracking.adjustment.block_matrix import SIDE, BlockPattern
 from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.adjustment.anchored_points import AnchoredPoints
 from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Index, Mask
 from aquaflow.tracking.adjustment.joint import JointAdjustmentResult, JointProblem

@@ -16,8 +16,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.keyframes.place import KeyframePlace, depths_at
 from aquaflow.prior.contract import Encoding

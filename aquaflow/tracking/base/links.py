@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.optimise.least_squares import NormalEquations, Rules, covariance_of, minimise
 from aquaflow.optimise.robust import Huber
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aquaflow.config import GraphConfig
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch
 from aquaflow.tracking.graph.equations import (
     DAMPING,
     Array,

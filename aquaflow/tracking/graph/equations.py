@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from aquaflow.geometry.similarity_batch import Sim3Batch, right_jacobian_inverse
+from aquaflow.geometry.similarity import Sim3Batch, right_jacobian_inverse
 from aquaflow.optimise.robust import Huber
 
 Array = npt.NDArray[np.float64]

@@ -21,8 +21,7 @@ import numpy as np
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import KeyframeEdge, Revisit

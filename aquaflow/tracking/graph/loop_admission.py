@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order
 
 from aquaflow.config import GraphConfig
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3Batch
 from aquaflow.tracking.graph.equations import Array, Index, Mask, Rows, poses_of, residuals
 
 WITNESSES = 8

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aquaflow.config import GraphConfig
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.graph.equations import Array, Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import (

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aquaflow.config import GraphConfig
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.graph.equations import Index, Mask, Rows, poses_of
 
 _SIM3 = [("R", np.float64, (3, 3)), ("t", np.float64, 3), ("scale", np.float64)]

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.triangulation import triangulate
-from aquaflow.geometry.two_view import MIN_MATCHES, pose_candidates
+from aquaflow.geometry.two_view import MIN_MATCHES, pose_candidates, triangulate
 from aquaflow.prior.contract import PairGeometry
 from aquaflow.tracking.initialisation.bundle import MAX_ITERATIONS, Bundle, BundleResult, adjust
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.keyframes import LearnedDepths, Pointmap
 from aquaflow.optimise.robust import Tukey, sigma_of
 from aquaflow.prior.contract import Float, Mask, RangeUnit

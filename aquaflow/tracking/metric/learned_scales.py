@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.tracking import LearnedConfig
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.optimise.robust import sigma_of
 from aquaflow.tracking.graph.equations import Rows, poses_of

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.telemetry.estimator import Estimate
 from aquaflow.telemetry.factors.altitude import AltitudeFactor
 from aquaflow.telemetry.factors.attitude import HeadingFactor, TiltFactor

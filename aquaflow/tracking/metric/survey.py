@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.arrays import to_sim3
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes import Pointmap
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.telemetry import Telemetry

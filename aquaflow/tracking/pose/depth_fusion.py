@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.triangulation import (
+from aquaflow.geometry.two_view import (
     MAX_REPROJECTION_PX,
     MAX_RHO,
     MIN_CROSS_SQ,

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry

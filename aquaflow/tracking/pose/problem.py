@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.keyframes import Pointmap
 from aquaflow.tracking.pose.solver import PoseProblem
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.base.clocks import computer
-from aquaflow.base.clocks.computer import SYNCHRONISED, clock_is_set, kernel_is_synchronised
+from aquaflow.base.clocks import wall as computer
+from aquaflow.base.clocks.wall import SYNCHRONISED, clock_is_set, kernel_is_synchronised
 
 NOW_S = 1_795_365_000.0
 

@@ -12,7 +12,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage import atomic
-from aquaflow.base.storage.array_file import write_arrays
+from aquaflow.base.storage.archive import write_arrays
 from aquaflow.base.storage.atomic import (
     atomic_write,
     fresh_file,

@@ -16,7 +16,7 @@ from aquaflow.base.storage.dive_status import (
     rescaling,
     unfinished_reason,
 )
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 
 LIVE = DiveStatus(DiveState.OPEN, boot="boot")
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.folder_lock import FolderLock, is_held
+from aquaflow.base.storage.whole_folder import FolderLock, is_held
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 lock = FolderLock(Path(sys.argv[1]))
 print("held", flush=True)
 time.sleep(600)

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as arrays_of
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage import spill
-from aquaflow.base.storage.array_file import Arrays, read_arrays, write_arrays
+from aquaflow.base.storage.archive import Arrays, read_arrays, write_arrays
 from aquaflow.base.storage.spill import Spill, read_item
 
 Thing = npt.NDArray[np.int64]

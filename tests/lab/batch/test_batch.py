@@ -168,7 +168,7 @@ def test_a_batch_that_is_stopped_leaves_no_process_and_can_be_continued(
 def test_two_batches_never_write_to_one_site(
     recordings: Path, poisoned: dict[str, str], tmp_path: Path
 ) -> None:
-    from aquaflow.base.storage.folder_lock import FolderLock
+    from aquaflow.base.storage.whole_folder import FolderLock
 
     lock = FolderLock(tmp_path)
     ran = run_batch(poisoned, recordings, "--out", tmp_path, *SHORT)

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.base.storage.facts_file import write_facts_file
+from aquaflow.base.storage.archive import write_facts_file
 from aquaflow.cli import app
 from aquaflow.geometry.arrays import add_prefix
 from aquaflow.lab.bench.growth import benchmark as bm

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from aquaflow.base.profiler import pace
+from aquaflow.base.stages import pace
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.config import Config
 from aquaflow.lab.bench.runner import KEYS

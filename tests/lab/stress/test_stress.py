@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry import camera, similarity, triangulation
+from aquaflow.geometry import camera, similarity
+from aquaflow.geometry import two_view as triangulation
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.stress import suite, swim
 from aquaflow.lab.stress.case import REGISTRY, Check

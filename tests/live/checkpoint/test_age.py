@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.storage.dive_status import DiveState
-from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.live.checkpoint.resume import Choice, age_of, choose
 from aquaflow.live.clock_reading import ClockReading

@@ -14,8 +14,7 @@ import pytest
 import torch
 
 from aquaflow.base.storage import spill
-from aquaflow.config.service import CheckpointConfig
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import CheckpointConfig, ViewerConfig
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
 from aquaflow.lab.evaluation.trajectory import read_tum

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.errors import ConfigError
-from aquaflow.base.storage.facts_file import write_facts_file
+from aquaflow.base.storage.archive import write_facts_file
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.live.checkpoint.generations import previous_file, read_state, state_file

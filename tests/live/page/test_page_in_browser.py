@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.config.service import ListenConfig
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ListenConfig, ViewerConfig
 from aquaflow.live.health import http
 from aquaflow.survey.viewer.page import ViewerPage
 from tests.browser import Browser, needs_browser

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.device import MountingConfig
-from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import RecordingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.port import FlatPort
 from aquaflow.live.recorder import Recorder, RecorderStatus

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from aquaflow.config.device import MountingConfig
+from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.live.vehicle.body_geometry import BodyPoseInWorld
 from aquaflow.live.vehicle.pose_output import PoseOutput

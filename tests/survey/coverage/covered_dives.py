@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.errors.failures import Failures
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.survey.coverage.coverage_files import CoverageFiles
 from aquaflow.survey.coverage.live_coverage import LiveCoverage

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.coverage import PageView, page_view

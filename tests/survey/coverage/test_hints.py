@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.survey.coverage.hints import (
     LEAST_STEPS,
     CoverageFigures,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.survey.coverage import page_view
 from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.next_line import LineState, line_state

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from aquaflow.config.coverage import CoverageConfig
+from aquaflow.config.service import CoverageConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.coverage import sub_map_coverage
 from aquaflow.survey.coverage.classes import CoverageClass

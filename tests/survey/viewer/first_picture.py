@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.survey.viewer.finished import finished_dive, prepare, show_dive

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.viewer import finished
 from aquaflow.survey.viewer.finished import FinishedDive, finished_dive, prepare, show_dive

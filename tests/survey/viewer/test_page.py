@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.config.service import ViewerConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.page import ViewerPage

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from aquaflow.config.known_lengths import BoardConfig, CharucoConfig
+from aquaflow.config.telemetry import BoardConfig, CharucoConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.telemetry.known_lengths.board_size import BoardView

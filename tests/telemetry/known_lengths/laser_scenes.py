@@ -7,7 +7,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from aquaflow.config.known_lengths import LasersConfig
+from aquaflow.config.telemetry import LasersConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.known_lengths.board_size import BoardView

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from aquaflow.config.known_lengths import BoardConfig, CharucoConfig, MarkersConfig
+from aquaflow.config.telemetry import BoardConfig, CharucoConfig, MarkersConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.telemetry.known_lengths.board_size import BoardView, board_lengths
 from aquaflow.telemetry.known_lengths.boards import BoardDetector, BoardSighting, marker_corners

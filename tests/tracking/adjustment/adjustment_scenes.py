@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, so3_exp
 from aquaflow.tracking.adjustment.equations import AnchorMatches
 from aquaflow.tracking.adjustment.joint import JointProblem
 from aquaflow.tracking.adjustment.links import Links

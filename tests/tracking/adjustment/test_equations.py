@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.adjustment.block_matrix import BlockPattern
 from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,

@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.alignment import align
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 
 Array = npt.NDArray[np.float64]

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.graph.equations import Equations, Misfit
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from tests.tracking.graph.graph_scenes import (

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.telemetry.estimator import Estimate
 from aquaflow.tracking.metric.measured import NEAR_S, Corrections, world_edges

@@ -8,7 +8,7 @@ import pytest
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.triangulation import triangulate
+from aquaflow.geometry.two_view import triangulate
 from aquaflow.keyframes import UNKNOWN_VARIANCE, KeyframeStore, Pointmap
 from aquaflow.render.library import load_library
 from aquaflow.tracking.pose import depth_fusion

@@ -16,10 +16,9 @@ from urllib.request import urlopen
 
 import numpy as np
 
-from aquaflow.base.profiler import Profiler
-from aquaflow.base.stages import Stages
-from aquaflow.base.storage.facts_file import write_facts_file
-from aquaflow.config.viewer import ViewerConfig
+from aquaflow.base.stages import Profiler, Stages
+from aquaflow.base.storage.archive import write_facts_file
+from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun

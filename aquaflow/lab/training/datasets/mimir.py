@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.errors.plain_yaml import read_mapping
+from aquaflow.base.errors.regular_file import read_mapping
 from aquaflow.lab.training.datasets.openexr import read_exr
 from aquaflow.lab.training.datasets.posed import (
     NED_TO_OPTICAL,

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from aquaflow.base.errors import ConfigError, InputError
-from aquaflow.base.errors.plain_yaml import read_mapping
+from aquaflow.base.errors.regular_file import read_mapping
 from aquaflow.config.stage import StageConfig
 from aquaflow.lab.training.datasets.posed import (
     Depth,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.scratch import scratch_array
+from aquaflow.base.storage.atomic import scratch_array
 from aquaflow.dive.posed_views import PosedView
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3

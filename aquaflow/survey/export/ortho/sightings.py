@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.scratch import scratch_array
+from aquaflow.base.storage.atomic import scratch_array
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
