@@ -18,8 +18,7 @@ from aquaflow.drivers.supervisor import Deliver, Supervisor
 from aquaflow.drivers.transport import OpenLink, opener
 from aquaflow.sources import RawTap
 from aquaflow.sources.newest import Newest
-from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
-from aquaflow.sources.pilot import HearsPilot, Obey
+from aquaflow.sources.outbound import AcceptsMessages, HearsPilot, Obey, OutboundMessage
 from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)

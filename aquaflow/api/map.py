@@ -16,8 +16,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.config.presets import load_configured
 from aquaflow.dive.dive import Dive, read_dive
-from aquaflow.dive.map_file import SUFFIX, read_map_file
-from aquaflow.dive.map_splats import splats_of
+from aquaflow.dive.map_file import SUFFIX, read_map_file, splats_of
 from aquaflow.dive.medium import Medium, Rgb
 from aquaflow.dive.ply import PlyGaussians
 from aquaflow.geometry.camera import CameraModel, load_camera
@@ -28,7 +27,7 @@ from aquaflow.render import RendererName, select_renderer
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
 from aquaflow.sources import RecordedCamera, open_recording
-from aquaflow.sources.telemetry_input import open_telemetry
+from aquaflow.sources.newest import open_telemetry
 from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.world_frame import WorldFrame
 

@@ -268,7 +268,7 @@ def _posed_pictures(
     restored: bool,
     progress: Progress,
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.dive.posed_pictures import export_posed_pictures
+    from aquaflow.dive.restored import export_posed_pictures
     from aquaflow.survey.export.colmap import write_colmap
     from aquaflow.survey.export.nerfstudio import write_nerfstudio
 

@@ -8,27 +8,32 @@ pass is repeated with what it found.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
-from aquaflow.dive.found_camera import FoundCamera, usable
 from aquaflow.geometry.camera import CameraModel, guess_camera
-from aquaflow.geometry.optics import TERMS
+from aquaflow.geometry.optics import LENS_PRIOR_SIGMA, TERMS, virtual_centre
+from aquaflow.geometry.port import FlatPort, Port
+from aquaflow.geometry.rectification import Rectifier
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Keypoints
 from aquaflow.slam import Slam
 from aquaflow.sources import CameraSource
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.tracking.calibration_check import TOLERANCE, LensError, most_turning, view_of
 from aquaflow.tracking.frames import Tracked
-from aquaflow.tracking.lens_views import LensViews
+from aquaflow.tracking.lens_views import MOST_VIEWS, LensViews
 from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.self_calibration import FoundLens, found_lens
 from aquaflow.types import Frame
@@ -184,3 +189,194 @@ def _nearness(keyframe: Keyframe) -> float:
     rho = keyframe.pointmap.rho[::EVERY_PIXEL, ::EVERY_PIXEL]
     known = rho[rho > 0.0]
     return float(np.median(known)) / keyframe.T_wc.scale if len(known) else 0.0
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The camera of a dive without calibration, as its own pictures show it.
+
+log = logging.getLogger(__name__)
+
+UNKNOWN_PERCENT = round(100.0 * float(LENS_PRIOR_SIGMA[0]))
+"""Standard deviation of a guessed focal length."""
+
+
+@dataclass(frozen=True)
+class FoundCamera:
+    """A calibration with the uncertainty that the dive leaves of it."""
+
+    camera: CameraModel
+    """For pictures of the mapped width, distortion and all."""
+    lens: FoundLens
+    used: bool
+    """True if the dive was mapped with it; False if it is known only at the end."""
+
+    def to_json(self) -> dict[str, Any]:
+        """For metrics.json; px of the mapped width."""
+        focal, sigma = self.camera.fx, self.lens.sigma
+        return {
+            "verdict": "found" if self.lens.known else "cannot be told",
+            "used": self.used,
+            "focal_px": round(focal, 2),
+            "focal_sigma_px": round(focal * float(sigma[0]), 2),
+            "focal_widths": round(focal / self.camera.width, 4),
+            "k1": round(float(self.lens.lens[1]), 4),
+            "k1_sigma": round(float(sigma[1]), 4),
+            "noise_px": round(self.lens.noise * focal, 3),
+            "keyframes": self.lens.views,
+            "matches": self.lens.matches,
+        }
+
+    @property
+    def suggested(self) -> bool:
+        """True if it is good enough for the next dive, and this one did without it."""
+        return self.lens.known and not self.used
+
+    @property
+    def words(self) -> str:
+        """Values, standard deviations, and what they are from."""
+        focal, sigma = self.camera.fx, self.lens.sigma
+        return (
+            f"{focal:.0f} ± {focal * sigma[0]:.0f} px ({100.0 * sigma[0]:.1f} %), radial "
+            f"distortion {self.lens.lens[1]:.3f} ± {sigma[1]:.3f}, from {self.lens.views} keyframes"
+        )
+
+
+def in_words(found: FoundCamera | None, tracked: CameraModel, file: str) -> str:
+    """A sentence on a dive without calibration, mapped with ``tracked``; ``file`` holds what was
+    found too late to be used."""
+    guessed = found.camera if found is not None and found.used else tracked
+    unknown = f"{guessed.fx:.0f} px is a guess, good to {UNKNOWN_PERCENT} %"
+    if found is None:
+        return (
+            f"no calibration was used, and too few pictures show the lens: the focal length of "
+            f"{unknown}, distortion ignored"
+        )
+    if not found.lens.known:
+        return (
+            "no calibration was used, and the camera's motion does not determine its focal "
+            f"length: {unknown}; turn the camera while filming, or calibrate it in water"
+        )
+    if found.used:
+        return f"no calibration was used: focal length found to be {found.words}"
+    return (
+        f"no calibration was used: the dive was mapped with a focal length of {tracked.fx:.0f} "
+        f"px and no distortion; at its end the focal length was found to be {found.words}; give "
+        f"{file} to the next dive as calibration"
+    )
+
+
+def from_keyframes(keyframes: Sequence[Keyframe]) -> FoundCamera | None:
+    """The camera that the keyframes of a finished dive show.
+
+    Raises:
+        InputError: a keyframe cannot be read back.
+    """
+    chosen = most_turning([each for each in keyframes if each.T_wc.is_finite()], MOST_VIEWS)
+    views = [view_of(keyframe) for keyframe in chosen]
+    lens = found_lens(views)
+    if lens is None:
+        return None
+    camera = usable(lens.camera(views[0].camera))
+    return None if camera is None else FoundCamera(camera, lens, used=False)
+
+
+def usable(camera: CameraModel) -> CameraModel | None:
+    """None for a distortion that folds the picture over itself."""
+    try:
+        Rectifier(camera, camera.width)
+    except ConfigError:
+        log.warning("the lens that was found cannot be: %s", camera)
+        return None
+    return camera
+
+
+# --- ----------------------------------------------------------------------------------------------
+# What the calibration check found, for metrics.json and in words.
+
+REMEDY = (
+    "calibrate the camera in water, or in air with its port's measures, or leave out --calib to "
+    "have the focal length estimated from the dive; until then distances and shapes are distorted"
+)
+"""What a user can do about a calibration that does not fit."""
+
+
+def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
+    """For metrics.json; None where the dive does not determine it. The noise of the matches is in
+    px of the calibration's own pictures."""
+    focal_known, radial_known = np.logical_or(error.known, error.named)
+    focal, k1 = _fitting(error, calibration)
+    return {
+        "verdict": verdict(error),
+        "focal_px": round(focal, 1) if focal_known else None,
+        "focal_sigma_px": round(focal * float(error.sigma[0]), 1),
+        "focal_given_px": round(calibration.fx, 1),
+        "k1": round(k1, 4) if radial_known else None,
+        "k1_sigma": round(float(error.sigma[1]), 4),
+        "k1_given": _k1(calibration),
+        "noise_px": {
+            "as_given": round(error.noise_given * calibration.fx, 3),
+            "focal_and_k1_fitted": round(error.noise_fitted * calibration.fx, 3),
+            "further_terms_fitted": round(error.noise_further * calibration.fx, 3),
+        },
+        "chance": float(f"{error.chance:.1e}"),
+        "keyframes": error.views,
+        "matches": error.matches,
+    }
+
+
+def verdict(error: LensError) -> str:
+    """One of ``wrong``, ``fits`` and ``cannot be told``."""
+    if error.wrong:
+        return "wrong"
+    return "fits" if all(error.known) else "cannot be told"
+
+
+def warning(error: LensError, calibration: CameraModel) -> str:
+    """A sentence for a wrong calibration: the error, its certainty, the remedy."""
+    focal, k1 = _fitting(error, calibration)
+    focal_named, radial_named = error.named
+    asked = []
+    if focal_named or not radial_named:
+        asked.append(
+            f"a focal length of {focal:.0f} px (standard deviation "
+            f"{focal * error.sigma[0]:.0f}) instead of {calibration.fx:.0f} px"
+        )
+    if radial_named or not focal_named:
+        asked.append(
+            f"a first radial distortion k1 of {k1:.3f} (standard deviation "
+            f"{error.sigma[1]:.3f}) instead of {_k1(calibration):.3f}"
+        )
+    return (
+        f"the calibration does not fit the dive: its pictures ask for {' and '.join(asked)}; a "
+        f"calibration good to {100.0 * TOLERANCE[0]:.0f} % would look so by chance once in "
+        f"{_times(error.chance)} dives; {REMEDY}"
+    )
+
+
+def port_note(calibration: CameraModel, port: Port) -> str:
+    """Through which port the pictures were rectified."""
+    size = (
+        f"{port.distance_m:g} m before {port.thickness_m:g} m of glass"
+        if isinstance(port, FlatPort)
+        else f"{port.radius_m:g} m in radius, {port.thickness_m:g} m thick"
+    )
+    behind = -1e3 * float(virtual_centre(calibration)[2])
+    where = f"{abs(behind):.1f} mm {'behind' if behind >= 0.0 else 'ahead of'} the lens"
+    return (
+        f"the pictures were rectified through a {port.kind} port ({size}, water of index "
+        f"{port.water:.4f}), exactly at {port.range_m:g} m; the path is that of a point {where}"
+    )
+
+
+def _times(chance: float) -> str:
+    return "more than a million" if chance < 1e-6 else f"{10 ** int(-np.log10(chance)):,}"
+
+
+def _fitting(error: LensError, calibration: CameraModel) -> tuple[float, float]:
+    """Focal length, px of the calibration, and k1 that fit the dive."""
+    growth = float(np.exp(error.log_focal))
+    return calibration.fx * growth, error.radial + _k1(calibration) * growth**2
+
+
+def _k1(calibration: CameraModel) -> float:
+    return calibration.distortion[0] if calibration.is_distorted else 0.0

@@ -9,7 +9,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import IntEnum
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,18 +21,28 @@ import numpy as np
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors import InputError
-from aquaflow.dive.deliverable import Deliverable, DeliverablePhase
+from aquaflow.dive.calibration_pass import FoundCamera
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import IN_SITE, DiveFolder
-from aquaflow.dive.found_camera import FoundCamera
+from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.from_maps import held_out_examples, water_in_numbers
-from aquaflow.dive.georeference import GEOREFERENCE, georeference
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
-from aquaflow.dive.in_site import in_site
-from aquaflow.dive.medium_json import medium_json
-from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
-from aquaflow.dive.path_rows import path_rows
-from aquaflow.dive.results import WaterSummary, largest_sub_map, refined_poses, tracked_poses
+from aquaflow.dive.metric_outputs import (
+    MetricOutputs,
+    held_out_in,
+    path_rows,
+    water_in,
+    worlds_in_words,
+)
+from aquaflow.dive.placement import GEOREFERENCE, georeference, in_site
+from aquaflow.dive.results import (
+    WaterSummary,
+    largest_sub_map,
+    medium_json,
+    refined_poses,
+    tracked_poses,
+)
+from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
@@ -60,7 +74,7 @@ class Deliverables:
     ) -> None:
         """``results``: all frames with their final poses; ``calibration``: as given, if any, else
         ``found`` may be there; ``outputs``: None where nothing but the map is known; ``others``:
-        as :func:`aquaflow.dive.deliverable.deliverables_of` gives them."""
+        as :func:`aquaflow.dive.deliverables.deliverables_of` gives them."""
         self.name, self.folder, self.slam = name, folder, slam
         self.results, self.calibration, self._found = results, calibration, found
         self._others = others or {}
@@ -310,3 +324,122 @@ def _edges(graph: Snapshot) -> Rows:
         rows[name] = graph.edges[name]
     rows["trust"] = graph.trust["trust"]
     return rows
+
+
+# --- ----------------------------------------------------------------------------------------------
+# What is made of a dive beside the files of the core: reports, plan views, numbers of the ground.
+#
+# Each is found by an entry point of ``GROUP``; so a site can have its own (docs/extending.md).
+
+GROUP = "aquaflow.deliverables"
+"""Entry points: subclasses of :class:`Deliverable`, each called with the dive's ``Slam``."""
+
+
+class DeliverablePhase(IntEnum):
+    """When, at the end of a dive, a deliverable is made."""
+
+    WRITE = 1
+    """After trajectory, cameras, maps and places."""
+    MEASURE = 2
+    """After the held-out views were evaluated; within the time that the dive's end has."""
+    REPORT = 3
+    """Last, when everything but ``metrics.json`` is in the folder."""
+
+
+class Deliverable:
+    """One thing that is made of a dive. Whatever it raises costs itself alone."""
+
+    phase = DeliverablePhase.WRITE
+    stage: str
+    """What is done, in words, for the note on a failure: ``drawing the overview``."""
+
+    def __init__(self, slam: Slam) -> None:
+        """``slam``: of the dive, before its first frame."""
+        self.slam = slam
+
+    def look(self) -> None:
+        """Take in what is new of the dive; called while the frames of a replay come, after each
+        keyframe. A live dive's coverage is looked at by a thread of its own."""
+
+    def refresh(self, dive: Dive) -> None:
+        """Make it of a ``dive`` that goes on, where that is cheap."""
+
+    def make(self, dive: Dive, until: Deadline) -> None:
+        """Make it of a ``dive`` that has ended, and write it into its folder.
+
+        Args:
+            dive: with everything that is in memory by now.
+            until: when to leave out what can be left out.
+
+        Raises:
+            InputError: a file cannot be written.
+        """
+        raise NotImplementedError
+
+
+def deliverables_of(slam: Slam) -> dict[str, Deliverable]:
+    """One of each that is installed, by name, in the order in which they are made: by phase, then
+    by name. One that cannot be loaded costs itself."""
+    found: dict[str, Deliverable] = {}
+    for entry in entry_points(group=GROUP):
+        with slam.failures.contain(f"loading the deliverable {entry.name}"):
+            found[entry.name] = entry.load()(slam)
+    return dict(sorted(found.items(), key=lambda each: (each[1].phase, each[0])))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The frames of a finished dive with what is known of each: class, pose, time, navigation.
+
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class FinishedFrame:
+    """A frame of the recording."""
+
+    row: FrameRow
+    t_ns: int
+    """Since the recording's first frame."""
+    T_nc: Sim3 | None
+    """Camera to n; None without a pose in the largest sub-map."""
+    known: PoseRow | None
+    """Of a frame with such a pose, in a dive that has trajectory.csv."""
+
+
+def read_finished_frames(dive: Dive) -> list[FinishedFrame]:
+    """Every frame that was asked for, in the order of the recording; poses and what is known of
+    them only of the largest sub-map, whose world the map's is.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    rows, main, path = dive.frames, dive.main, dive.trajectory
+    poses = {
+        _ns(float(t)): Sim3(R, position)
+        for t, R, position in zip(path.t_s, path.R_wc, path.positions, strict=True)
+    }
+    known = {row.index: row for row in dive.poses} if dive.has(TRAJECTORY_CSV) else {}
+    frames = []
+    for row in sorted(rows, key=lambda row: row.t_s):
+        t_ns, placed = _ns(row.t_s), row.sub_map == main
+        frames.append(
+            FinishedFrame(
+                row, t_ns, poses.get(t_ns) if placed else None,
+                known.get(row.index) if placed else None,
+            )
+        )  # fmt: skip
+    return frames
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * NS)
+
+
+def start_ns(metrics: dict[str, Any]) -> int | None:
+    """UTC of the recording's first frame, ns since 1970; None where nothing stated it."""
+    said = metrics.get("utc_start")
+    if said is None:
+        return None
+    begun = datetime.fromisoformat(str(said).replace("Z", "+00:00"))
+    whole = begun.replace(microsecond=0)
+    return int(whole.timestamp()) * NS + begun.microsecond * 1000

@@ -311,7 +311,7 @@ class DiveFolder:
         from_maps.write_splats(self.path, mapper, water, frame, suffix)
 
     def write_medium(self, content: dict[str, Any]) -> None:
-        """medium.json: the water, see :func:`aquaflow.dive.medium_json.medium_json`."""
+        """medium.json: the water, see :func:`aquaflow.dive.results.medium_json`."""
         self.write_json("medium.json", content)
 
     def write_held_out(self, examples: list[HeldOut]) -> None:

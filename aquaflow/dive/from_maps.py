@@ -37,19 +37,19 @@ def held_out_examples(slam: Slam, sub_map: int, until: Deadline | None = None) -
 
 
 def write_exact(folder: Path, mapper: Mapper, suffix: str = "") -> None:
-    """See :func:`aquaflow.dive.map_files.write_exact`."""
-    from aquaflow.dive import map_files
+    """See :func:`aquaflow.dive.map_file.write_exact`."""
+    from aquaflow.dive import map_file
 
-    map_files.write_exact(folder, mapper, suffix)
+    map_file.write_exact(folder, mapper, suffix)
 
 
 def write_splats(
     folder: Path, mapper: Mapper, water: WaterSummary | None, frame: WorldFrame, suffix: str = ""
 ) -> None:
-    """See :func:`aquaflow.dive.map_files.write_splats`."""
-    from aquaflow.dive import map_files
+    """See :func:`aquaflow.dive.map_file.write_splats`."""
+    from aquaflow.dive import map_file
 
-    map_files.write_splats(folder, mapper, water, frame, suffix)
+    map_file.write_splats(folder, mapper, water, frame, suffix)
 
 
 def attenuations(mappers: Mapping[int, Mapper]) -> dict[int, list[float]]:

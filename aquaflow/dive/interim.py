@@ -18,9 +18,8 @@ import numpy.typing as npt
 from aquaflow import __version__
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.from_maps import water_in_numbers
-from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, frame_numbers, water_in, worlds_in_words
-from aquaflow.dive.results import WaterSummary
+from aquaflow.dive.results import WaterSummary, medium_json
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.arrays import Array

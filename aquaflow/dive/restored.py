@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.png import write_png
-from aquaflow.dive.recorded import recorded_pictures
+from aquaflow.dive.point_cloud import PointCloud, PosedView, read_posed_views, read_splats
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
@@ -24,6 +26,9 @@ from aquaflow.mapping.restoration import (
     restored_picture,
 )
 from aquaflow.render.views import View, in_time
+from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
+from aquaflow.types import Frame
 
 LOOKS = 20
 """Frames, spread over the dive, that the common exposure is judged by."""
@@ -137,3 +142,133 @@ def _with_picture(
     )  # fmt: skip
     whole.log_gain, whole.light = view.log_gain, view.light
     return whole
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The recording's pictures of a dive's views, prepared as they were mapped.
+
+
+def recorded_pictures(
+    dive: Dive, recording: Path, views: Sequence[View]
+) -> Iterator[tuple[View, npt.NDArray[np.uint8]]]:
+    """Each of ``views``, which are in the order of the recording, with its picture [H, W, 3] RGB:
+    cropped, undistorted by the dive's camera and resized.
+
+    Raises:
+        InputError: the recording has not all of the frames, or has them in another size.
+        ConfigError: the dive's settings or its calibration cannot be read.
+    """
+    prepare = preparation_of(dive)
+    missing = {view.frame_index: view for view in views}
+    indices = list(missing)
+    every = math.gcd(*(index - indices[0] for index in indices)) or 1
+    source = open_recording(recording)
+    try:
+        for frame in source.frames(every, indices[0], indices[-1] + 1):
+            if isinstance(frame, Frame) and frame.index in missing:
+                view = missing.pop(frame.index)
+                picture = prepare(frame).image
+                _check_size(recording, picture, view.camera)
+                yield view, picture
+    finally:
+        source.close()
+    if missing:
+        raise InputError(
+            f"{recording} has no readable frame {min(missing)}, which {dive} mapped; give the "
+            "recording that the dive was made from"
+        )
+
+
+def preparation_of(dive: Dive, width: int | None = None) -> Preparation:
+    """How the pictures of ``dive`` were prepared: cropped, undistorted and resized, to ``width``
+    pixels in place of what was mapped.
+
+    Raises:
+        InputError, ConfigError: the dive's settings or its calibration cannot be read.
+    """
+    source = dive.config.source
+    if width is not None:
+        source = source.model_copy(update={"width": width})
+    return Preparation(source, dive.calibration)
+
+
+def _check_size(
+    recording: Path,
+    picture: npt.NDArray[np.uint8],  # [H, W, 3]
+    camera: CameraModel,
+) -> None:
+    height, width = picture.shape[:2]
+    if (height, width) != (camera.height, camera.width):
+        raise InputError(
+            f"the pictures of {recording} are {width} x {height} once prepared, the dive's "
+            f"{camera.width} x {camera.height}; give the recording that the dive was made from"
+        )
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Pictures with their poses and the map's points, as programs that build maps take them in.
+
+Pictures = Iterator[tuple[int, npt.NDArray[np.uint8]]]
+"""Frame index and picture [H, W, 3] RGB, or [H, W, 4] RGBA where open water was removed."""
+WriteModel = Callable[[Path, Sequence[PosedView], PointCloud], None]
+
+IMAGES = "images"
+"""Folder of the pictures, by the name that COLMAP, nerfstudio and OpenSplat look for."""
+
+
+def picture_name(frame_index: int) -> str:
+    """File name of the picture of a frame."""
+    return f"{frame_index:06d}.png"
+
+
+def export_posed_pictures(
+    dive: Dive,
+    out: Path,
+    write_model: WriteModel,
+    recording: Path | None,
+    restored: bool = False,
+    progress: Progress | None = None,
+) -> int:
+    """Write the pictures of the dive's largest sub-map to ``out/images``, undistorted, and let
+    ``write_model`` add cameras, poses and points; returns how many pictures there are.
+
+    With ``restored`` pictures and points are without water; without a ``recording`` such pictures
+    are drawn from the map.
+
+    Raises:
+        InputError: the dive has no map, the recording is missing or another, or a file cannot be
+            written.
+        ConfigError: the dive's settings cannot be read.
+    """
+    mapper = dive.map()
+    views, where = read_posed_views(dive, mapper)
+    cloud = PointCloud(read_splats(dive, where, water=not restored), views, where)
+    pictures = (
+        _without_water(dive, mapper, recording)
+        if restored
+        else _pictures_seen(dive, mapper, recording)
+    )
+    with whole_folder(out) as made:
+        (made / IMAGES).mkdir()
+        for done, (index, picture) in enumerate(pictures, start=1):
+            write_png(made / IMAGES / picture_name(index), picture)
+            if progress is not None:
+                progress(done, len(views))
+        write_model(made, views, cloud)
+    return len(views)
+
+
+def _pictures_seen(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
+    if recording is None:
+        raise InputError(
+            f"{dive} holds no pictures of its own; add --recording with what was mapped, or "
+            "--restored to have them drawn from the map"
+        )
+    pictures = recorded_pictures(dive, recording, in_time(mapper.views))
+    return ((view.frame_index, picture) for view, picture in pictures)
+
+
+def _without_water(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
+    exposure = exposure_without_water(dive, mapper)
+    frames = restored_frames(dive, mapper, recording)
+    return ((index, picture.picture_bytes(exposure)) for index, picture in frames)

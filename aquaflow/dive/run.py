@@ -20,13 +20,11 @@ from aquaflow.base.stages import pace
 from aquaflow.config import Config
 from aquaflow.config.mapping import InsertionConfig, OptimiserConfig
 from aquaflow.config.stage import StageConfig
-from aquaflow.dive import calibration_findings
-from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
-from aquaflow.dive.deliverables import Deliverables
+from aquaflow.dive import calibration_pass
+from aquaflow.dive.calibration_pass import FoundCamera, from_keyframes, in_words
+from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
-from aquaflow.dive.found_camera import FoundCamera, from_keyframes, in_words
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.dive.in_site import in_site_notes, in_site_numbers
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
     Navigation,
@@ -34,15 +32,15 @@ from aquaflow.dive.metric_outputs import (
     sub_maps_in_words,
     utc_numbers,
 )
+from aquaflow.dive.placement import in_site_notes, in_site_numbers
 from aquaflow.dive.results import metrics
 from aquaflow.mapping.work import MIN_VIEWS, Progress
 from aquaflow.recordings.kept_pictures import KeptPictures, PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
-from aquaflow.slam.finish_time import FinishTime
-from aquaflow.sources.picture_check import oddities
-from aquaflow.sources.preprocessing import Preparation
+from aquaflow.slam.slam import FinishTime
+from aquaflow.sources.preprocessing import Preparation, oddities
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
@@ -291,9 +289,7 @@ class DiveRun:
                 f"an overlay of {100.0 * overlay:.1f} % of the picture was found and masked"
             )
         if self.calibration is not None and self.calibration.port is not None:
-            self.notes.append(
-                calibration_findings.port_note(self.calibration, self.calibration.port)
-            )
+            self.notes.append(calibration_pass.port_note(self.calibration, self.calibration.port))
         if self.telemetry_log is not None and self.telemetry_log.lost:
             self.notes.append(
                 f"{self.telemetry_log.lost} samples of telemetry are not in {TELEMETRY}: the disk "
@@ -394,14 +390,14 @@ class DiveRun:
         error = self.lens_error
         if self.calibration is None or error is None or not error.wrong:
             return []
-        return [calibration_findings.warning(error, self.calibration)]
+        return [calibration_pass.warning(error, self.calibration)]
 
     @property
     def calibration_numbers(self) -> dict[str, Any] | None:
         """What the check found; None before it, without a calibration, and where it cannot tell."""
         if self.calibration is None or self.lens_error is None:
             return None
-        return calibration_findings.to_json(self.lens_error, self.calibration)
+        return calibration_pass.to_json(self.lens_error, self.calibration)
 
     def _numbers(self, results: list[Tracked], made: Deliverables) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started

@@ -13,7 +13,7 @@ from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.stage import MountingConfig
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.loop import LiveLoop
-from aquaflow.sources.wall_clock import OLDEST_NS
+from aquaflow.sources.newest import OLDEST_NS
 
 
 class DiveStatusFile:

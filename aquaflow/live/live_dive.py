@@ -23,7 +23,7 @@ from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import FINISHING
 from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import Progress
-from aquaflow.slam.finish_time import FinishTime
+from aquaflow.slam.slam import FinishTime
 
 log = logging.getLogger(__name__)
 

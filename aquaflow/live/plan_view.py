@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.dive.page_axes import names_of, page_axes
+from aquaflow.dive.placement import names_of, page_axes
 from aquaflow.dive.views import CoverageView
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.dive_parts import Parts

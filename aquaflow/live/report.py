@@ -9,7 +9,7 @@ from typing import Any
 
 from aquaflow import __version__
 from aquaflow.config.service import ViewerConfig
-from aquaflow.dive.in_site import in_site_numbers
+from aquaflow.dive.placement import in_site_numbers
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed

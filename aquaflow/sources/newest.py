@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Generic, TypeVar
+
+from aquaflow.base.clocks.wall import WallClockWatch
+from aquaflow.base.errors import InputError
+from aquaflow.base.errors.failures import Failures
+from aquaflow.config import SourceConfig
+from aquaflow.sources import RecordedTelemetry, open_recorded_telemetry, telemetry_reader
+from aquaflow.types import Dropped, Frame, TelemetrySample, UtcTime
 
 Item = TypeVar("Item")
 
@@ -75,3 +84,136 @@ class Newest(Generic[Item]):
         while len(items) > longest:
             self.overtaken += 1
             self._discard(items.popleft())
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Reads a recording past frames on which its reader raises; only these frames are lost.
+
+Event = TypeVar("Event", bound=Frame | Dropped | TelemetrySample)
+
+MOST_UNREADABLE = 5
+"""Frames in a row that a recording fails on until the rest is given up."""
+
+
+def read_past_failures(
+    read: Callable[[int], Iterator[Event]],
+    start: int,
+    source: SourceConfig,
+    frame_count: int | None,
+    failures: Failures,
+    give_up: Callable[[int], object],
+) -> Iterator[Event | Dropped]:
+    """Events of ``read(start)``; after a frame on which it raises, reading continues with the next.
+
+    ``give_up`` is called with the next frame after ``MOST_UNREADABLE`` failures in a row.
+
+    Raises:
+        Exception: the error of the reader, if the recording fails before its first frame.
+    """
+    ends = [end for end in (frame_count, source.stop) if end is not None]
+    t_ns, failed_in_a_row, any_read = 0, 0, False
+    events = read(start)
+    while failed_in_a_row < MOST_UNREADABLE:
+        with failures.contain("reading", start) as reading:
+            event = next(events, None)
+        if reading.error is not None:
+            if not any_read:
+                raise reading.error
+            if ends and start >= min(ends):
+                return  # closing failed after the last frame
+            failed_in_a_row += 1
+            yield Dropped(start, t_ns, "reading failed, see log.jsonl")
+            start += source.every
+            events = read(start)
+            continue
+        if event is None:
+            return
+        if isinstance(event, (Frame, Dropped)):
+            any_read, failed_in_a_row = True, 0
+            start, t_ns = event.index + source.every, event.t_ns
+        yield event
+    give_up(start)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The computer's own clock as a source of UTC, so that a recording holds what a live dive heard.
+
+SOURCE = "computer/clock"
+"""Name of the samples' source."""
+EVERY_S = 10.0
+"""A computer's clock drifts by 1e-4 at most: 1 ms."""
+OLDEST_NS = 1_735_689_600 * 1_000_000_000
+"""2025-01-01: a clock from before this program existed was never set."""
+
+
+class WallClock:
+    """Yields the wall clock every ``every_s`` until it is closed, as the computer has it: after it
+    was set, as it is then."""
+
+    def __init__(self, every_s: float = EVERY_S) -> None:
+        self._every_s = every_s
+        self._closed = threading.Event()
+        self._watch = WallClockWatch()
+
+    def samples(self) -> Iterator[UtcTime]:
+        """The first at once; none while the computer's clock was never set."""
+        while not self._closed.is_set():
+            now = self._watch.read()
+            t_ns, utc_ns = now.monotonic_ns, now.monotonic_ns + now.offset_ns
+            if utc_ns >= OLDEST_NS:
+                yield UtcTime(t_ns, t_ns, SOURCE, utc_ns)
+            self._closed.wait(self._every_s)
+
+    def close(self) -> None:
+        """End the samples."""
+        self._closed.set()
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The telemetry that a replay is given: what is on the recording's clock, and what is not yet.
+
+
+@dataclass(frozen=True)
+class TelemetryInput:
+    """Opened sources of telemetry; nothing has been read of them."""
+
+    synchronised: Sequence[RecordedTelemetry] = ()
+    """On the recording's clock."""
+    unsynchronised: Mapping[str, RecordedTelemetry] = field(default_factory=dict)
+    """By file name: logs on a clock of their own."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences of every source about what was left out, complete once it has been read."""
+        return [
+            note
+            for source in (*self.synchronised, *self.unsynchronised.values())
+            for note in source.notes
+        ]
+
+    def close(self) -> None:
+        """Close every source."""
+        for source in (*self.synchronised, *self.unsynchronised.values()):
+            source.close()
+
+
+def open_telemetry(
+    recording: Path | None, logs: Sequence[Path] = (), offset_s: float | None = None
+) -> TelemetryInput:
+    """The telemetry that the recording brings itself, if it lies on disk, and ``logs`` beside it.
+
+    ``offset_s`` is when every log begins, in seconds after the recording's first picture; None if
+    that is not known.
+
+    Raises:
+        InputError: a log is missing, no installed source finds telemetry in it, or an offset was
+            given without a log.
+    """
+    if offset_s is not None and not logs:
+        raise InputError("--telemetry-offset says when a log begins; give the log by --telemetry")
+    reader = None if recording is None else telemetry_reader(recording)
+    own = [] if reader is None or recording is None else [reader.open(recording)]
+    if offset_s is not None:
+        opened = [open_recorded_telemetry(log, offset_s) for log in logs]
+        return TelemetryInput(synchronised=[*own, *opened])
+    return TelemetryInput(own, {str(log): open_recorded_telemetry(log) for log in logs})

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.dive.deliverable import Deliverable, DeliverablePhase
+from aquaflow.dive.deliverables import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.finished_dive import numbers_at_the_end
 from aquaflow.survey.measure.reef_files import write_reef_numbers

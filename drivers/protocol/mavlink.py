@@ -15,8 +15,7 @@ from aquaflow.drivers.protocol.mavlink_outbound import Receiver, messages_of
 from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.transport.mavlink2rest import Wanted
-from aquaflow.sources.outbound import OutboundMessage, StatusText
-from aquaflow.sources.pilot import Obey, PilotRequest
+from aquaflow.sources.outbound import Obey, OutboundMessage, PilotRequest, StatusText
 from aquaflow.types import TelemetrySample
 
 OUR_COMPONENT = 197

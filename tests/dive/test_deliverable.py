@@ -11,8 +11,8 @@ import pytest
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
-from aquaflow.dive import deliverable as module
-from aquaflow.dive.deliverable import Deliverable, DeliverablePhase, deliverables_of
+from aquaflow.dive import deliverables as module
+from aquaflow.dive.deliverables import Deliverable, DeliverablePhase, deliverables_of
 from aquaflow.dive.dive import Dive
 
 

@@ -11,8 +11,8 @@ import pytest
 
 import aquaflow
 from aquaflow.base.errors import InputError
+from aquaflow.dive.deliverables import read_finished_frames
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.finished_frames import read_finished_frames
 from aquaflow.survey.report import render_report
 from aquaflow.survey.report.report_of import report_of
 

@@ -17,7 +17,7 @@ from aquaflow.dive.ply import read_ply
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.slam import Slam
-from aquaflow.slam.finish_time import EVALUATED, REFINED, SETTLED, FinishTime
+from aquaflow.slam.slam import EVALUATED, REFINED, SETTLED, FinishTime
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame
 

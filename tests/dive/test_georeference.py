@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.dive.georeference import georeference, to_geodetic
-from aquaflow.dive.utm_grid import utm_epsg
+from aquaflow.dive.placement import georeference, to_geodetic, utm_epsg
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from tests.metric_scenes import TRONDHEIM, metric_frame
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 import aquaflow
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config import Config, load_config
-from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
-from aquaflow.dive.deliverables import Deliverables
+from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,

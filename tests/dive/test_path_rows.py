@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.dive.metric_outputs import MetricOutputs, Navigation
-from aquaflow.dive.path_rows import path_rows
+from aquaflow.dive.metric_outputs import MetricOutputs, Navigation, path_rows
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from aquaflow.base.errors import InputError
 from aquaflow.cli import app
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.posed_pictures import WriteModel, export_posed_pictures
+from aquaflow.dive.restored import WriteModel, export_posed_pictures
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.survey.export.colmap import write_colmap

@@ -14,8 +14,7 @@ import yaml
 
 from aquaflow.config import Config
 from aquaflow.dive import calibration_pass, replay, run
-from aquaflow.dive.calibration_pass import found_in
-from aquaflow.dive.found_camera import FoundCamera, in_words, usable
+from aquaflow.dive.calibration_pass import FoundCamera, found_in, in_words, usable
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.tracking.self_calibration import FoundLens

@@ -33,8 +33,7 @@ from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.slam import Slam
 from aquaflow.sources.newest import Newest
-from aquaflow.sources.outbound import OutboundMessage
-from aquaflow.sources.pilot import HearsPilot
+from aquaflow.sources.outbound import HearsPilot, OutboundMessage
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import CameraModel, Dropped, Frame
 

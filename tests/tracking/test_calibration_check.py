@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aquaflow.dive.calibration_findings import to_json, verdict, warning
+from aquaflow.dive.calibration_pass import to_json, verdict, warning
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints

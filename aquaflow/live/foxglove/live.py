@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from aquaflow.config.service import FoxgloveConfig
-from aquaflow.dive.path_rows import attitude_of
+from aquaflow.dive.metric_outputs import attitude_of
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree

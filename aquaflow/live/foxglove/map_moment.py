@@ -11,8 +11,7 @@ import torch
 
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ply import PlyGaussians
-from aquaflow.dive.point_cloud import PointCloud
-from aquaflow.dive.posed_views import PosedView, posed_views
+from aquaflow.dive.point_cloud import PointCloud, PosedView, posed_views
 from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
 from aquaflow.mapping.map_copy import MapCopy, copy_map

@@ -20,14 +20,15 @@ from typing import Any
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import FoxgloveConfig
-from aquaflow.dive.ros.definitions import (
+from aquaflow.dive.ros.topics import (
     MESSAGE_ENCODING,
+    OF_FINISHED_DIVES,
     SCHEMA_ENCODING,
+    TYPES,
     definition,
     encode,
     require_rosbags,
 )
-from aquaflow.dive.ros.topics import OF_FINISHED_DIVES, TYPES
 from aquaflow.web import HttpRequest, HttpResponse, WebServer
 from aquaflow.web.access import Access
 

@@ -12,7 +12,7 @@ from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, ServiceRequest
 from aquaflow.live.service_status import ServiceStatus
-from aquaflow.sources.pilot import HearsPilot, PilotRequest
+from aquaflow.sources.outbound import HearsPilot, PilotRequest
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import numpy as np
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.georeference import to_geodetic
+from aquaflow.dive.placement import to_geodetic
 from aquaflow.geometry.alignment import north_east
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive, read_site

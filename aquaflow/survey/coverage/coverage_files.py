@@ -8,7 +8,7 @@ from typing import Any
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.dive.deliverable import Deliverable
+from aquaflow.dive.deliverables import Deliverable
 from aquaflow.dive.dive import Dive
 from aquaflow.slam import Slam
 from aquaflow.survey.coverage import CoverageClass, DiveCoverage, PageView, mapping_range

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import CoverageConfig
-from aquaflow.dive.page_axes import page_axes, page_rotation
+from aquaflow.dive.placement import page_axes, page_rotation
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.survey.coverage.footprint import Footprint

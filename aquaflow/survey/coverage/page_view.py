@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.service import CoverageConfig
-from aquaflow.dive.page_axes import names_of, page_axes
+from aquaflow.dive.placement import names_of, page_axes
 from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.next_line import LineState, line_state
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of

@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.dive.point_cloud import PointCloud
-from aquaflow.dive.posed_pictures import picture_name
-from aquaflow.dive.posed_views import PosedView
+from aquaflow.dive.point_cloud import PointCloud, PosedView
+from aquaflow.dive.restored import picture_name
 from aquaflow.geometry.camera import CameraModel
 
 MODEL = Path("sparse") / "0"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +13,40 @@ import numpy as np
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError, printable
-from aquaflow.base.storage.atomic import write_json
-from aquaflow.dive.dive import Dive
-from aquaflow.dive.finished_frames import (
+from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.dive.deliverables import (
     FinishedFrame,
     read_finished_frames,
     start_ns,
 )
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.point_cloud import read_point_cloud
 from aquaflow.dive.restored import SeenFrame, exposure_without_water, seen_frames, without_water
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
-from aquaflow.dive.ros.layout import layout, pictures
-from aquaflow.dive.ros.mcap_file import RosFile, ros_file
+from aquaflow.dive.ros.topics import (
+    ALTITUDE,
+    CAMERA,
+    CAMERA_INFO,
+    DEPTH,
+    DIAGNOSTICS,
+    HEADING,
+    LASTING,
+    MESSAGE_ENCODING,
+    PATH,
+    POINTS,
+    POSE,
+    QUALITY,
+    RENDERED,
+    RESTORED,
+    SCHEMA_ENCODING,
+    SPEED,
+    TYPES,
+    definition,
+    encode,
+    require_rosbags,
+)
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.transfers import picture_out
@@ -226,3 +248,158 @@ class _Pictures:
         if self._progress is not None:
             self._progress(self._done, len(source.mapper.views))
         return len(shown)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# An MCAP file of ROS 2 messages, as ``ros2 bag`` writes and plays it, and Foxglove opens it.
+
+LIBRARY = "aquaflow"
+"""Who wrote the file, in its header."""
+QOS = (
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: {durability}\n"
+    "  deadline:\n    sec: 0\n    nsec: 0\n  lifespan:\n    sec: 0\n    nsec: 0\n"
+    "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 0\n    nsec: 0\n"
+    "  avoid_ros_namespace_conventions: false\n"
+)
+"""Quality of service by ROS's numbers, as rosbag2 keeps it: reliable; durability 1 is transient
+local, 2 volatile."""
+
+
+class RosFile:
+    """Appends messages; channels and schemas are written when first used."""
+
+    def __init__(self, writer: Any) -> None:
+        """``writer`` is one of mcap's that was started."""
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self.count = 0
+        """Messages so far."""
+
+    def write(self, topic: str, t_ns: int, message: Any) -> None:
+        """Append a message of ``topic``, which happened at ``t_ns``."""
+        if topic not in self._channels:
+            name = TYPES[topic]
+            if name not in self._schemas:
+                self._schemas[name] = self._writer.register_schema(
+                    name, SCHEMA_ENCODING, definition(name)
+                )
+            qos = QOS.format(durability=1 if topic in LASTING else 2)
+            self._channels[topic] = self._writer.register_channel(
+                topic, MESSAGE_ENCODING, self._schemas[name], {"offered_qos_profiles": qos}
+            )
+        self._writer.add_message(self._channels[topic], t_ns, encode(message), t_ns, self.count)
+        self.count += 1
+
+
+@contextlib.contextmanager
+def ros_file(path: Path, facts: Mapping[str, str]) -> Iterator[RosFile]:
+    """A file that is there, whole, once the block ends without an exception; ``facts`` are said of
+    it in a metadata record named ``aquaflow``.
+
+    Raises:
+        InputError: a library is missing, or the file cannot be written.
+    """
+    require_rosbags()
+    if find_spec("mcap") is None:
+        raise InputError("MCAP files need mcap; install it: pip install 'aquaflow[recording]'")
+    from mcap.writer import CompressionType, Writer
+
+    with atomic_write(path) as stream:
+        writer: Any = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library=LIBRARY)
+        writer.add_metadata(LIBRARY, dict(facts))
+        yield RosFile(writer)
+        writer.finish()
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The layout that Foxglove and Lichtblick show a dive with: map and path, pictures, plots.
+
+COLOURS = ("#4e98e2", "#f5774d", "#f7df71", "#5cd6a9")
+"""Of the lines of a plot, one after the other."""
+
+
+def layout(picture: str, beside: str) -> dict[str, Any]:
+    """The layout as JSON; ``picture`` and ``beside`` are the topics of its two pictures."""
+    panels = {
+        "3D!map": _scene(),
+        "Image!picture": _image(picture),
+        "Image!beside": _image(beside),
+        "Plot!place": _plot([DEPTH, ALTITUDE, SPEED]),
+        "Plot!heading": _plot([HEADING]),
+        "Plot!quality": _plot([QUALITY]),
+        "DiagnosticSummary!states": {"topicToRender": DIAGNOSTICS, "sortByLevel": True},
+    }
+    right = _column(["Image!picture", "Image!beside"])
+    below = _row(["Plot!place", "Plot!heading", "Plot!quality", "DiagnosticSummary!states"])
+    above = {"first": "3D!map", "second": right, "direction": "row", "splitPercentage": 60}
+    whole = {"first": above, "second": below, "direction": "column", "splitPercentage": 70}
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": whole,
+    }
+
+
+def pictures(recorded: bool, has_water: bool) -> tuple[str, str]:
+    """The two topics to show: what the dive has of camera, render and restored picture."""
+    first = CAMERA if recorded else RENDERED
+    return first, RESTORED if has_water else RENDERED
+
+
+def _scene() -> dict[str, Any]:
+    """The map and the path from above and aside."""
+    return {
+        "followTf": MAP,
+        "followMode": "follow-none",
+        "scene": {"transforms": {"axisScale": 0.3}, "backgroundColor": "#101418"},
+        "cameraState": {
+            "distance": 12, "phi": 50, "thetaOffset": 45, "fovy": 45, "near": 0.01, "far": 5000,
+            "target": [0, 0, 0], "targetOffset": [0, 0, 0], "targetOrientation": [0, 0, 0, 1],
+            "perspective": True,
+        },
+        "topics": {
+            POINTS: {"visible": True, "colorField": "rgb", "colorMode": "rgb", "pointSize": 3},
+            PATH: {"visible": True, "gradient": ["#5cd6a9ff", "#5cd6a9ff"], "lineWidth": 0.02},
+            POSE: {"visible": True, "type": "axis", "axisScale": 0.5, "showCovariance": True},
+            CAMERA_INFO: {"visible": True, "distance": 0.5, "width": 0.01},
+        },
+        "layers": {"grid": {"layerId": "foxglove.Grid", "frameId": MAP, "size": 20}},
+    }  # fmt: skip
+
+
+def _image(topic: str) -> dict[str, Any]:
+    return {"imageMode": {"imageTopic": topic, "calibrationTopic": CAMERA_INFO}}
+
+
+def _plot(topics: list[str]) -> dict[str, Any]:
+    lines = [
+        {
+            "value": f"{topic}.data", "label": topic.rpartition("/")[2], "enabled": True,
+            "timestampMethod": "receiveTime", "color": COLOURS[number % len(COLOURS)],
+        }
+        for number, topic in enumerate(topics)
+    ]  # fmt: skip
+    return {
+        "paths": lines, "showLegend": True, "legendDisplay": "top", "xAxisVal": "timestamp",
+        "showXAxisLabels": True, "showYAxisLabels": True, "isSynced": True,
+    }  # fmt: skip
+
+
+def _column(panels: list[str]) -> dict[str, Any]:
+    return {
+        "first": panels[0], "second": panels[1], "direction": "column", "splitPercentage": 50
+    }  # fmt: skip
+
+
+def _row(panels: list[str]) -> Any:
+    """The panels side by side, each as wide as the others."""
+    if len(panels) == 1:
+        return panels[0]
+    return {
+        "first": panels[0], "second": _row(panels[1:]), "direction": "row",
+        "splitPercentage": 100 / len(panels),
+    }  # fmt: skip

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.dive.point_cloud import PointCloud
-from aquaflow.dive.posed_pictures import IMAGES, picture_name
-from aquaflow.dive.posed_views import PosedView
+from aquaflow.dive.point_cloud import PointCloud, PosedView
+from aquaflow.dive.restored import IMAGES, picture_name
 from aquaflow.geometry.camera import CameraModel
 
 TRANSFORMS = "transforms.json"

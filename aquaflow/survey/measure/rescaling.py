@@ -24,8 +24,7 @@ from aquaflow.base.storage.dive_status import rescaling
 from aquaflow.dive import trajectory_csv
 from aquaflow.dive.dive import HELD_OUT, METRICS, TRAJECTORY, Dive
 from aquaflow.dive.medium import NAME as MEDIUM
-from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
-from aquaflow.dive.path_rows import position_sigma, speeds_of
+from aquaflow.dive.metric_outputs import frame_numbers, position_sigma, speeds_of, worlds_in_words
 from aquaflow.dive.ply import PlyGaussians, read_ply, write_ply
 from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
 from aquaflow.dive.tum import write_tum

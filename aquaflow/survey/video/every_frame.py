@@ -12,10 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.deliverables import FinishedFrame, read_finished_frames
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.finished_frames import FinishedFrame, read_finished_frames
-from aquaflow.dive.recorded import preparation_of
-from aquaflow.dive.restored import SeenFrame, exposure_without_water, without_water
+from aquaflow.dive.restored import SeenFrame, exposure_without_water, preparation_of, without_water
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View, in_time

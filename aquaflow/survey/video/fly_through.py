@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.map_splats import splats_of
+from aquaflow.dive.map_file import splats_of
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.deliverables import FinishedFrame, read_finished_frames
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.finished_frames import FinishedFrame, read_finished_frames
 from aquaflow.dive.restored import exposure_without_water, seen_frames, without_water
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.transfers import picture_out

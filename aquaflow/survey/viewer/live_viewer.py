@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.service import ViewerConfig
-from aquaflow.dive.path_rows import attitude_of
+from aquaflow.dive.metric_outputs import attitude_of
 from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.work import OwnedMaps

@@ -16,8 +16,7 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Stages
 from aquaflow.config import Config
 from aquaflow.dive import replay
-from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
-from aquaflow.dive.deliverables import Deliverables
+from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import Finished
 from aquaflow.mapping import water_fitting

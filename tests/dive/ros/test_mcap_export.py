@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive, read_dive
-from aquaflow.dive.point_cloud import read_point_cloud
-from aquaflow.dive.posed_views import read_posed_views
+from aquaflow.dive.point_cloud import read_point_cloud, read_posed_views
 from aquaflow.dive.restored import exposure_without_water, restored_frames
 from aquaflow.dive.ros.topics import LASTING, TYPES
 from aquaflow.survey.export.mcap_export import export_mcap

@@ -28,7 +28,7 @@ from aquaflow.config.service import FoxgloveConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
-from aquaflow.dive.ros.definitions import encode
+from aquaflow.dive.ros.topics import encode
 from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.foxglove.live import LiveFoxglove
@@ -282,7 +282,7 @@ def test_a_missing_package_is_named(module: str, monkeypatch: pytest.MonkeyPatch
     def missing(name: str) -> object:
         return None if name == module else there(name)
 
-    for place in ("aquaflow.live.foxglove.server", "aquaflow.dive.ros.definitions"):
+    for place in ("aquaflow.live.foxglove.server", "aquaflow.dive.ros.topics"):
         monkeypatch.setattr(f"{place}.find_spec", missing)
     with pytest.raises(InputError, match=module):
         FoxgloveServer(LOOPBACK, "test")

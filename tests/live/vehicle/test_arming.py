@@ -16,7 +16,7 @@ from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, Servi
 from aquaflow.live.onboard import map_live
 from aquaflow.live.service_status import ServiceStatus
 from aquaflow.live.vehicle.arming import Arming, refuse_without_autopilot
-from aquaflow.sources.pilot import Obey
+from aquaflow.sources.outbound import Obey
 from tests.live.live_scenes import ToldFeed
 
 

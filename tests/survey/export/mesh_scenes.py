@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.dive.posed_views import PosedView
+from aquaflow.dive.point_cloud import PosedView
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.mesh.blocks import Blocks

@@ -11,8 +11,8 @@ from pyproj import Transformer
 
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.config import Config, MappingConfig
-from aquaflow.dive.georeference import to_geodetic
 from aquaflow.dive.map_file import write_map_file
+from aquaflow.dive.placement import to_geodetic
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper

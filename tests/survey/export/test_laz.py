@@ -17,8 +17,7 @@ from aquaflow.cli import app
 from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
-from aquaflow.dive.point_cloud import nearest_cameras, read_point_cloud
-from aquaflow.dive.posed_views import read_posed_views
+from aquaflow.dive.point_cloud import nearest_cameras, read_point_cloud, read_posed_views
 from aquaflow.survey.export.laz import write_laz
 from tests.survey.export.small_dive import (
     ORIGIN,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.dive.georeference import to_geodetic
+from aquaflow.dive.placement import to_geodetic
 from aquaflow.survey.measure.asked import GeodeticPoint, MapPoint, Pixel, parse_point
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
 from aquaflow.telemetry.metric_file import read_frame_of_map

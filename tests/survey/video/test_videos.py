@@ -13,8 +13,8 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.deliverables import read_finished_frames
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.finished_frames import read_finished_frames
 from aquaflow.dive.restored import exposure_without_water, restored_frames, seen_frames
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.survey.video.every_frame import LONGEST_GAP_S, CameraPoses, restore_every_frame

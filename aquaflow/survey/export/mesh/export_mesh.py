@@ -17,7 +17,7 @@ from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
 from aquaflow.dive.png import encoded_png
-from aquaflow.dive.posed_views import read_posed_views
+from aquaflow.dive.point_cloud import read_posed_views
 from aquaflow.survey.export.mesh.atlas import lay_out, paint
 from aquaflow.survey.export.mesh.blocks import Blocks
 from aquaflow.survey.export.mesh.colouring import batches, look_at, shown_colours

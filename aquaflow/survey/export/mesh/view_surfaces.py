@@ -17,7 +17,7 @@ import torch
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import scratch_array
-from aquaflow.dive.posed_views import PosedView
+from aquaflow.dive.point_cloud import PosedView
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from aquaflow.dive.map_splats import splats_of
+from aquaflow.dive.map_file import splats_of
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.dive.placement import UPRIGHT_FROM_DOWN
-from aquaflow.dive.utm_grid import grid_of
+from aquaflow.dive.placement import UPRIGHT_FROM_DOWN, grid_of
 from aquaflow.geometry.similarity import Sim3, nearest_rotation
 from aquaflow.telemetry.world_frame import WorldFrame
 
