@@ -12,18 +12,18 @@ import torch
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.held_out_example import Fidelity, HeldOut
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
     RestoredPicture,
     common_exposure,
     restored_picture,
     to_bytes,
 )
+from aquaflow.mapping.scene import RenderedMap
 from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
 from aquaflow.slam import Slam
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.sightings import SOLID
 
 REGISTERING = 0.85
 """Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a

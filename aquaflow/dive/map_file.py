@@ -20,11 +20,10 @@ from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_fac
 from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.water_summary import water_of
-from aquaflow.mapping.clear_colours import restored_gaussians
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import restored_gaussians
 from aquaflow.mapping.state import deserialise, serialise
-from aquaflow.render.activation import radiance
-from aquaflow.render.contract import Renderer
+from aquaflow.render.contract import Renderer, radiance
 from aquaflow.render.transfers import map_out
 from aquaflow.telemetry.world_frame import WorldFrame
 

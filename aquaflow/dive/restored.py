@@ -18,13 +18,13 @@ from aquaflow.dive.png import write_png
 from aquaflow.dive.point_cloud import PointCloud, PosedView, read_posed_views, read_splats
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
     RestoredPicture,
     common_exposure,
     drawn_without_water,
     restored_picture,
 )
+from aquaflow.mapping.scene import RenderedMap
 from aquaflow.render.views import View, in_time
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation

@@ -12,8 +12,8 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.transfers import picture_out, water_in, water_out
 from aquaflow.render.views import View
-from aquaflow.water.image_formation import WaterParameters
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.medium import WaterParameters
+from aquaflow.water.sightings import SOLID
 
 RANGE_PERCENTILES = (5.0, 95.0)
 """Percent; values outside are single pixels at edges of the map."""

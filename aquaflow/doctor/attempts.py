@@ -69,7 +69,7 @@ def draw(make: Callable[[], Renderer] | None = None) -> Figures:
     """
     from aquaflow.render.example_scene import SMALL, height_field
     from aquaflow.render.gsplat import GsplatRenderer
-    from aquaflow.render.parity import PICTURE, differences, drawn_and_differentiated, too_far
+    from aquaflow.render.reference import PICTURE, differences, drawn_and_differentiated, too_far
 
     scene, times = height_field(SMALL), [time.perf_counter()]
     renderer = (make or GsplatRenderer)()
@@ -103,7 +103,7 @@ def _check_torch(renderer: Renderer) -> None:
 
 def _failure(what: str, error: RuntimeError) -> str:
     """One sentence on a failure of ``what``, torch or gsplat."""
-    from aquaflow.render.gpu import Gpu, gpu_here
+    from aquaflow.render.gsplat import Gpu, gpu_here
 
     gpu = gpu_here()
     if NO_KERNEL not in str(error) or not isinstance(gpu, Gpu):

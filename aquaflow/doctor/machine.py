@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from aquaflow.doctor.attempts import Attempt, Figures, apart
 
 if TYPE_CHECKING:
-    from aquaflow.render.gpu import Gpu
+    from aquaflow.render.gsplat import Gpu
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class CheckResult:
 def _torch_gpu() -> Gpu | str:
     """The GPU that torch sees, or why it sees none; there may be no torch, as on 32 bits."""
     try:
-        from aquaflow.render.gpu import gpu_here
+        from aquaflow.render.gsplat import gpu_here
     except ImportError:
         return "torch is not installed"
     return gpu_here()

@@ -13,30 +13,33 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.gaussians.gaussians import GaussianMap
-from aquaflow.mapping.gaussians.insertion import (
+from aquaflow.mapping.gaussians import (
     COVERED_ALPHA,
+    GaussianMap,
     alpha_where_agreed,
     colour_range,
     insertion_probability,
+    move_gaussians,
+    move_views,
     new_gaussians,
     select,
     thin,
     tracked_range,
     worth_keeping,
 )
-from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
 from aquaflow.mapping.neural.neural import NeuralGaussians
-from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
-from aquaflow.mapping.optimisation.objective import Objective
+from aquaflow.mapping.optimisation.map_optimiser import (
+    MapOptimiser,
+    Objective,
+    refining_rates,
+    sampled_views,
+    shuffled_views,
+)
 from aquaflow.mapping.optimisation.registration import register
-from aquaflow.mapping.optimisation.schedule import refining_rates, sampled_views, shuffled_views
-from aquaflow.mapping.rendering import RenderedMap
-from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.scene_water import rebalance
-from aquaflow.mapping.water_fitting import WaterFitting
+from aquaflow.mapping.scene import RenderedMap, Scene
+from aquaflow.mapping.scene_water import WaterFitting, rebalance
 from aquaflow.render.contract import Renderer
-from aquaflow.render.device_memory import give_back_after
+from aquaflow.render.gsplat import give_back_after
 from aquaflow.render.views import View, in_time
 from aquaflow.water.medium import LearnedMedium
 

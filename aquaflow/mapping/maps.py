@@ -24,13 +24,13 @@ from aquaflow.geometry.arrays import (
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import state
 from aquaflow.mapping.device_work import DeviceWork
-from aquaflow.mapping.gaussians.reanchoring import move_views
+from aquaflow.mapping.gaussians import move_views
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
 from aquaflow.mapping.work import MIN_VIEWS, Growth, Insertion, Progress
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
-from aquaflow.render.device_memory import give_back_idle, usable_share
+from aquaflow.render.gsplat import give_back_idle, usable_share
 from aquaflow.render.views import View, ViewStore, in_time
 
 

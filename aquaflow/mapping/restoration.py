@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
-from aquaflow.mapping.clear_colours import restored_radiance
-from aquaflow.mapping.rendering import RenderedMap
-from aquaflow.mapping.scene import Scene
-from aquaflow.render.transfers import picture_out, water_in
+from aquaflow.mapping.scene import RenderedMap, Scene, orientations
+from aquaflow.render.transfers import map_out, picture_out, water_in
 from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.exposure import Recovered
+from aquaflow.water.medium import MIN_TRANSMISSION, WaterParameters
+from aquaflow.water.sightings import SOLID
 
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""
@@ -38,7 +39,7 @@ class RestoredPicture:
     """[H, W] bool, False where open water was removed; None where it stays in the picture."""
     amplification: Tensor | None
     """[2, 3] RGB, mean over what was restored: as applied, and the most that the posterior allows
-    (see water/white_balance.py); None where nothing was, or without a posterior."""
+    (see water/exposure.py); None where nothing was, or without a posterior."""
 
     def picture_bytes(self, exposure: float) -> npt.NDArray[np.uint8]:
         """[H, W, 3], or [H, W, 4] with alpha where open water was removed."""
@@ -55,7 +56,7 @@ class RestoredPicture:
 @torch.no_grad()
 def restored_picture(scene: Scene, view: View, shown: RenderedMap) -> RestoredPicture:
     """The picture without water, at the ranges that the map ``shown`` from the view has, in the
-    white balance that the camera had for what was nearest (see water/white_balance.py).
+    white balance that the camera had for what was nearest (see water/exposure.py).
 
     Where the vehicle is in the picture, the map's own radiance, bounded alike. J-hat keeps the
     detail that the map has lost: on synthetic dives it is 5 dB closer to the clean scene than the
@@ -130,3 +131,57 @@ def to_bytes(
 ) -> npt.NDArray[np.uint8]:
     """[...] as 8-bit."""
     return np.asarray(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The map's own colours without water, bounded as those of restored pictures are.
+#
+# The map's radiance J was found behind its water so that pictures fit; where little light came back
+# it is as uncertain as that light. So it is put behind the water again, at the range from which it
+# was seen, and recovered as a picture is (water/exposure.py): no channel is amplified beyond
+# what its light there allows. Restored frames, PLY files, the viewer, orthos and meshes show this.
+
+
+@torch.no_grad()
+def restored_radiance(
+    scene: Scene,
+    radiance: Tensor,  # [..., 3] J
+    z: Tensor,  # [...] range from which it was seen, map units
+    water: WaterParameters | None,
+) -> Recovered:
+    """J as it is shown without ``water``, in the white balance of what is nearest; all of it where
+    there is no water."""
+    if water is None:
+        return Recovered(radiance, torch.ones_like(z))
+    T = water.transmission(z)
+    if scene.balance is None:
+        # Before the first fit, as Water.restore has it.
+        weakest = (T > MIN_TRANSMISSION).all(dim=-1)
+        return Recovered(radiance * (T / MIN_TRANSMISSION).clamp_max(1.0), weakest.to(T.dtype))
+    return scene.balance.recover(radiance * T + water.backscatter(z), z, water)
+
+
+def mean_water(scene: Scene, views: Sequence[View]) -> WaterParameters | None:
+    """The water of the mean of ``views``; None where there is none."""
+    if not scene.medium.active or not views:
+        return None
+    with torch.no_grad():
+        water: WaterParameters = scene.medium(orientations(views, scene.device))
+        return replace(water, beta_a=water.beta_a.mean(dim=0))
+
+
+@torch.no_grad()
+def restored_gaussians(
+    scene: Scene,
+    radiance: Tensor,  # [N, 3] of the Gaussians
+    views: Sequence[View],
+) -> Tensor:
+    """[N, 3] colours of the Gaussians without water, each as the nearest of ``views`` saw it."""
+    water = mean_water(scene, views)
+    if water is None:
+        return radiance
+    centres = np.stack([view.T_wc.t for view in views])
+    nearest = KDTree(centres).query(map_out(scene.gaussians.means))[0]
+    return restored_radiance(
+        scene, radiance, water_in(np.asarray(nearest), radiance.device), water
+    ).picture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,20 +13,17 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MediumConfig, SunlightConfig
-from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.neural.neural import NeuralGaussians
-from aquaflow.mapping.rendering import RenderedMap, show
-from aquaflow.render.contract import Renderer
+from aquaflow.render.contract import Renderer, activate
 from aquaflow.render.transfers import picture_out, pose_in, water_in, water_out, weights_in
 from aquaflow.render.views import View
-from aquaflow.water.exposure import gain_of, learn_gain
-from aquaflow.water.image_formation import WaterParameters
-from aquaflow.water.medium import LearnedMedium
-from aquaflow.water.nearest import Nearest
-from aquaflow.water.open_water import open_water
-from aquaflow.water.shading import TERMS, gain_map
+from aquaflow.render.water import MIN_SOLID, compose_water
+from aquaflow.water.exposure import Recovered, WhiteBalance, gain_of, learn_gain
+from aquaflow.water.medium import LearnedMedium, WaterParameters
+from aquaflow.water.nearest import Nearest, open_water
+from aquaflow.water.parameters import TERMS, gain_map
 from aquaflow.water.sunlight import Sunlight
-from aquaflow.water.white_balance import Recovered, WhiteBalance
 
 MOST_DISTANCES = 1 << 22
 """Between Gaussians and cameras at a time: 16 MB. Half a million Gaussians and 5,000 views at once
@@ -276,3 +273,71 @@ def orientations(views: Sequence[View], device: torch.device) -> Tensor:
     """[V, 3, 3] camera to world."""
     rotations = np.array([view.T_wc.R for view in views], np.float32).reshape(-1, 3, 3)
     return pose_in(rotations, device)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# One picture of the map: clean radiance and range from the renderer, then the water.
+
+
+@dataclass(frozen=True)
+class RenderedMap:
+    """The map from one view."""
+
+    image: Tensor
+    """[H, W, 3] I-hat, through the water and with the camera's shading."""
+    radiance: Tensor
+    """[H, W, 3] J-tilde, without water, premultiplied by alpha."""
+    alpha: Tensor
+    """[H, W]"""
+    z: Tensor
+    """[H, W] range along the ray, map units; meaningless where alpha is near 0."""
+    visible: Tensor
+    """[N] bool"""
+    radius_px: Tensor
+    """[N]"""
+    active: Tensor | None = None
+    """[rows, columns] bool, the tiles that were drawn; None: all."""
+
+
+def show(
+    parameters: Mapping[str, Tensor],  # of a GaussianMap
+    water: WaterParameters | None,
+    gain: Tensor | None,  # [H, W] shading
+    renderer: Renderer,
+    view: View,
+    viewmat: Tensor,  # [4, 4] world to camera
+    active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
+    uneven: Tensor | None = None,  # [H, W] gain of the backscatter
+) -> RenderedMap:
+    """Draw the map; differentiable in the parameters, the water and the view matrix.
+
+    Range rides as a fourth colour channel divided by alpha, the same on every renderer.
+    """
+    centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    activated = activate(
+        parameters["means"],
+        parameters["log_scales"],
+        parameters["opacity_logits"],
+        parameters["raw_colours"],
+        centre,
+        renderer.threads,
+    )
+    drawn = renderer(
+        parameters["means"],
+        parameters["quats"],
+        *activated,
+        viewmat,
+        view.K(),
+        view.camera.width,
+        view.camera.height,
+        active,
+    )
+    clean = drawn.image[..., :3]
+    if water is None:
+        z = drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
+        image = clean if gain is None else clean * gain[..., None]
+    else:
+        image, z = compose_water(
+            drawn.image, drawn.alpha, water.stack(), renderer.threads, uneven, gain
+        )
+    return RenderedMap(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)

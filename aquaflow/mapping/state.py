@@ -8,10 +8,11 @@ on being optimised as if it had never been away, once its views have their pictu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -29,15 +30,16 @@ from aquaflow.geometry.arrays import (
     under,
 )
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural.neural import NeuralGaussians
+from aquaflow.mapping.restoration import restored_gaussians
 from aquaflow.render.adam import SelectiveAdam
-from aquaflow.render.contract import CPU, Renderer
+from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.dense_adam import STEP, DenseAdam
-from aquaflow.render.transfers import checkpoint_in, checkpoint_out
+from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
-from aquaflow.water.exposure import log_gains_of, set_log_gain
-from aquaflow.water.white_balance import WhiteBalance
+from aquaflow.water.exposure import WhiteBalance, log_gains_of, set_log_gain
 
 Facts = dict[str, Any]
 
@@ -260,3 +262,38 @@ def _prefix(
 def _under(prefix: str, arrays: Mapping[str, Any], device: torch.device) -> dict[str, Tensor]:
     """What :func:`_prefix` put there."""
     return {name: checkpoint_in(array, device) for name, array in under(prefix, arrays).items()}
+
+
+# --- ----------------------------------------------------------------------------------------------
+# A copy of what is shown of a map, which goes on being mapped meanwhile.
+
+
+@dataclass(frozen=True)
+class MapCopy:
+    """Copies of the shown parts of a map, for any thread."""
+
+    parameters: dict[str, npt.NDArray[np.float32]]
+    steps: npt.NDArray[np.int32]
+    """[N] optimiser steps of each Gaussian."""
+    clear: npt.NDArray[np.float32]
+    """[N, 3] without water."""
+    water: npt.NDArray[np.float32] | None
+    """[6, 3] beta, B_inf, b, B_res, d as the last camera sees it, and the gain of ``clear``."""
+    views: list[Sim3]
+    """T_wc of the mapped views; the last one is the newest."""
+
+
+@torch.no_grad()
+def copy_map(mapper: Mapper) -> MapCopy:
+    """In the mapping thread: a copy; a tenth of a second for 150,000 Gaussians."""
+    tensors = mapper.gaussians.parameters
+    plain = {name: map_out(tensor) for name, tensor in tensors.items()}
+    clear = restored_gaussians(mapper.scene, radiance(tensors["raw_colours"]), mapper.views)
+    view = mapper.views[-1]
+    water = mapper.scene.water(view)
+    rows = None
+    if water is not None:
+        rows = map_out(torch.cat([water.stack(), mapper.scene.white_gain()[None]]))
+    steps = map_out(mapper.optimiser.adam.steps)
+    poses = [each.T_wc for each in mapper.views]
+    return MapCopy(plain, steps, map_out(clear), rows, poses)

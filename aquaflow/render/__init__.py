@@ -26,7 +26,7 @@ def select_renderer(name: RendererName = "auto", threads: int | None = None) -> 
     """
     threads = None if threads is None else min(threads, core_count())
     from aquaflow.render import gsplat
-    from aquaflow.render.tiles import TileRenderer
+    from aquaflow.render.cpu import TileRenderer
 
     if name == "gsplat" or (name == "auto" and gsplat.available()):
         return gsplat.GsplatRenderer()
@@ -37,9 +37,8 @@ def select_renderer(name: RendererName = "auto", threads: int | None = None) -> 
 
 def cpu_renderer(threads: int | None = None, may_fall_back: bool = True) -> Renderer:
     """The CPU's renderer: compiled kernels, else, if it ``may_fall_back``, torch's tiles."""
-    from aquaflow.render.cpu import CpuRenderer
+    from aquaflow.render.cpu import CpuRenderer, TileRenderer
     from aquaflow.render.library import NativeUnavailableError
-    from aquaflow.render.tiles import TileRenderer
 
     try:
         return CpuRenderer(threads)

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import weakref
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.utils.checkpoint import checkpoint
 
-from aquaflow.render.contract import CPU, Rendering, check_devices, check_inputs
+from aquaflow.render.contract import (
+    CPU,
+    TILE_PX,
+    Rendering,
+    check_devices,
+    check_inputs,
+    tile_box,
+    tile_grid,
+)
 from aquaflow.render.library import STAGES, Library, load_library
+from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
 from aquaflow.render.tensor_address import pointer
 
 
@@ -148,3 +159,165 @@ class _Rasterise(torch.autograd.Function):
         incoming = [g_image.contiguous(), g_alpha.contiguous()]
         ctx.lease.call("aq_backward", *map(pointer, (*gaussians, image, *incoming, *gradients)))
         return (*gradients, *[None] * 6)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The fallback renderer: torch only, batches of tiles, for machines without a compiler.
+#
+# Correct and slow: every Gaussian of a tile is evaluated at every pixel of it.
+
+BATCH_ELEMENTS = 4_000_000
+"""Gaussian-pixel pairs held at once; backward recomputes each batch instead of keeping them all."""
+
+
+class TileRenderer:
+    """Tiles as a batch dimension, padded to the longest list of the batch."""
+
+    name = "tiles"
+    device = CPU
+    isa = "torch"
+
+    def __init__(self, threads: int | None = None) -> None:
+        """``threads`` is for reports: torch's own setting decides."""
+        self.threads = threads if threads is not None else torch.get_num_threads()
+
+    def __call__(
+        self,
+        means: Tensor,  # [N, 3] m, world
+        quats: Tensor,  # [N, 4] wxyz
+        scales: Tensor,  # [N, 3] m
+        opacities: Tensor,  # [N]
+        colours: Tensor,  # [N, C]
+        viewmat: Tensor,  # [4, 4] world -> camera
+        K: Tensor,  # [3, 3] px
+        width: int,
+        height: int,
+        active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
+    ) -> Rendering:
+        """Draw as the contract says, in the dtype of ``means``."""
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
+        check_devices(self.device, means, quats, scales, opacities, colours, viewmat, K, active)
+        dtype = means.dtype
+        colours = colours.to(dtype)
+        gaussians = (means, quats.to(dtype), scales.to(dtype), opacities.to(dtype), colours)
+        camera = (viewmat.to(dtype), K.detach().to(dtype))
+        if active is None:
+            active = torch.ones(tile_grid(width, height), dtype=torch.bool)
+        footprints = project(*gaussians, *camera, width, height, active)
+        drawn = _draw(footprints, colours, width, height, active)
+        visible, radius_px = footprints.scatter(len(means))
+        return Rendering(drawn[..., :-1], drawn[..., -1], visible, radius_px)
+
+
+@dataclass(frozen=True)
+class _TileLists:
+    """For every active tile, row by row, its footprints front to back."""
+
+    tile: Tensor  # [T] long, row by row
+    start: list[int]  # [T + 1]
+    footprint: Tensor  # [L] long
+
+
+def _tile_lists(
+    footprints: Footprints,
+    active: Tensor,  # [rows, columns] bool
+    width: int,
+    height: int,
+) -> _TileLists:
+    """Pairs of footprints and active tiles that their boxes touch."""
+    with torch.no_grad():
+        centre, extent = footprints.centre, footprints.extent
+        low, high = tile_box(centre - extent, centre + extent, width, height)
+        size = high - low + 1
+        count = size[:, 0] * size[:, 1]
+        footprint = torch.arange(len(count), device=count.device).repeat_interleave(count)
+        within = torch.arange(len(footprint), device=count.device)
+        within = within - (count.cumsum(0) - count)[footprint]
+        x = low[footprint, 0] + within % size[footprint, 0]
+        y = low[footprint, 1] + within // size[footprint, 0]
+        drawn = active[y, x]
+        tile = (y * active.shape[1] + x)[drawn]
+        tile, by_tile = torch.sort(tile, stable=True)  # stable: the lists stay in depth order
+        listed = torch.nonzero(active.reshape(-1))[:, 0]
+        per_tile = torch.bincount(tile, minlength=active.numel())[listed]
+        start = [0, *per_tile.cumsum(0).tolist()]
+    return _TileLists(listed, start, footprint[drawn][by_tile])
+
+
+def _batches(lists: _TileLists) -> list[tuple[int, int, int]]:
+    """Runs of tiles [first, last) with their longest list, each within BATCH_ELEMENTS."""
+    runs: list[tuple[int, int, int]] = []
+    first, longest = 0, 0
+    for tile in range(len(lists.tile)):
+        length = lists.start[tile + 1] - lists.start[tile]
+        elements = (tile + 1 - first) * max(longest, length) * TILE_PX * TILE_PX
+        if tile > first and elements > BATCH_ELEMENTS:
+            runs.append((first, tile, longest))
+            first, longest = tile, 0
+        longest = max(longest, length)
+    return [*runs, (first, len(lists.tile), longest)]
+
+
+def _draw(
+    footprints: Footprints,
+    colours: Tensor,  # [N, C]
+    width: int,
+    height: int,
+    active: Tensor,  # [rows, columns] bool
+) -> Tensor:
+    """[H, W, C + 1]: premultiplied colours, then alpha."""
+    lists = _tile_lists(footprints, active, width, height)
+    tiles_y, tiles_x = active.shape
+    opaque = torch.ones_like(colours[:, :1])
+    layers = torch.cat([colours, opaque], 1)[footprints.index]
+    drawn: list[Tensor] = []
+    for first, last, longest in _batches(lists):
+        slots, filled = _pad(lists, first, last, longest, layers.device)
+        corner = _tile_corners(lists.tile[first:last], tiles_x, layers)
+        arguments = (footprints.centre, footprints.conic, footprints.opacity, layers)
+        drawn.append(
+            checkpoint(_draw_batch, *arguments, slots, filled, corner, use_reentrant=False)
+        )
+    black = layers.new_zeros(active.numel(), TILE_PX * TILE_PX, layers.shape[1])
+    grid = black.index_copy(0, lists.tile, torch.cat(drawn))
+    grid = grid.view(tiles_y, tiles_x, TILE_PX, TILE_PX, -1)
+    image = grid.transpose(1, 2).reshape(tiles_y * TILE_PX, tiles_x * TILE_PX, -1)
+    return image[:height, :width]
+
+
+def _pad(
+    lists: _TileLists, first: int, last: int, longest: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """[T, longest] footprint per slot, and whether the slot is filled."""
+    start = torch.tensor(lists.start[first:last], dtype=torch.long, device=device)[:, None]
+    end = torch.tensor(lists.start[first + 1 : last + 1], dtype=torch.long, device=device)[:, None]
+    at = start + torch.arange(longest, device=device)
+    filled = at < end
+    return lists.footprint[torch.where(filled, at, 0)] if longest else at, filled
+
+
+def _tile_corners(
+    tile: Tensor,  # [T] long
+    tiles_x: int,
+    like: Tensor,  # [...] of the dtype that is wanted
+) -> Tensor:
+    """[T, 2] px."""
+    return TILE_PX * torch.stack([tile % tiles_x, tile // tiles_x], 1).to(like.dtype)
+
+
+def _draw_batch(
+    centre: Tensor,  # [M, 2] px
+    conic: Tensor,  # [M, 3]
+    opacity: Tensor,  # [M]
+    layers: Tensor,  # [M, C + 1]
+    slots: Tensor,  # [T, L]
+    filled: Tensor,  # [T, L]
+    corner: Tensor,  # [T, 2] px
+) -> Tensor:
+    """[T, TILE_PX^2, C + 1]."""
+    step = torch.arange(TILE_PX, dtype=centre.dtype, device=centre.device) + 0.5
+    pixels = torch.stack(torch.meshgrid(step, step, indexing="xy"), 2).view(-1, 2)
+    offset = (corner[:, None] + pixels)[:, None] - centre[slots][:, :, None]
+    faint = torch.zeros((), dtype=opacity.dtype, device=opacity.device)
+    alpha = alpha_at(offset, conic[slots], torch.where(filled, opacity[slots], faint))
+    return torch.einsum("tlp,tlc->tpc", blend_weights(alpha, 1), layers[slots])

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import re
 import sys
+import traceback
+import warnings
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from importlib import metadata
 
 import torch
 from torch import Tensor
 
-from aquaflow.base.errors import AquaFlowError
-from aquaflow.render.activity import active_pixels, touches_active
+from aquaflow.base.errors import AquaFlowError, first_line
 from aquaflow.render.contract import (
     DILATION_PX2,
     NEAR_PLANE_M,
     TILE_PX,
     Rendering,
+    active_pixels,
     check_devices,
     check_inputs,
     tile_grid,
+    touches_active,
 )
 
 OLDEST = (1, 5)
@@ -168,3 +172,96 @@ def _sound(
         finite = torch.isfinite(torch.cat([means, quats, scales, colours], 1)).all(1)
         positive = (scales > 0).all(1) & (opacities > 0) & torch.isfinite(opacities)
         return finite & positive & (quats.square().sum(1) > 0)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The GPU that torch sees, by its name, or why torch sees none.
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """What a report says of a GPU, and of the torch that reaches it."""
+
+    name: str
+    capability: str
+    """Compute capability, as in 8.7."""
+    memory_gb: float
+    torch: str
+    cuda: str
+    """Versions of torch, and of the CUDA that it was built with."""
+    kernels: tuple[str, ...]
+    """What torch's own kernels were compiled for, as in sm_87."""
+
+    def __str__(self) -> str:
+        """All of it in one line."""
+        return (
+            f"{self.name}, compute capability {self.capability}, {self.memory_gb:.1f} GB, "
+            f"torch {self.torch} with CUDA {self.cuda}"
+        )
+
+
+def gpu_here() -> Gpu | str:
+    """The first GPU, or half a sentence on why torch sees none."""
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} is a build for the processor"
+    with warnings.catch_warnings(record=True) as said:  # torch warns of a driver that is too old
+        warnings.simplefilter("always")
+        available = torch.cuda.is_available()
+    if not available:
+        cause = f" ({first_line(said[-1].message)})" if said else ""  # type: ignore[arg-type]
+        return f"torch {torch.__version__} with CUDA {torch.version.cuda} sees no GPU{cause}"
+    properties = torch.cuda.get_device_properties(0)
+    return Gpu(
+        properties.name,
+        f"{properties.major}.{properties.minor}",
+        properties.total_memory / 1e9,
+        torch.__version__,
+        torch.version.cuda,
+        tuple(torch.cuda.get_arch_list()),
+    )
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The memory of the device that a map lives on: how much is left, and giving back what is idle.
+#
+# torch keeps blocks that no tensor uses any more, and the driver counts them as taken; the next
+# tensors get them first. So what is left for a map is what the driver has, and those blocks. A new
+# tensor needs one block that is large enough: pieces in many blocks can be too small, and then
+# giving them back to the driver helps.
+
+
+def usable_share(device: torch.device) -> float | None:
+    """Of the device's memory, what new tensors may have, in [0, 1].
+
+    None on the CPU, for a device that is gone, and for a GPU without memory of its own (a
+    Jetson's): there it is the machine's that runs short.
+    """
+    if device.type == "cpu":
+        return None
+    try:
+        if torch.cuda.get_device_properties(device).is_integrated:
+            return None
+        free, total = torch.cuda.mem_get_info(device)
+        idle = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    except RuntimeError:
+        return None
+    return (free + idle) / total if total else None
+
+
+def give_back_idle(device: torch.device) -> None:
+    """Let the driver have the blocks that no tensor uses; waits for the device."""
+    if device.type != "cpu":
+        torch.cuda.empty_cache()
+
+
+def give_back_after(error: BaseException, device: torch.device) -> None:
+    """The same once a tensor found no room: what was on the way to it is freed first.
+
+    An exception holds the variables of all functions that it came through, and so their tensors.
+    """
+    if device.type != "cpu":
+        cause: BaseException | None = error
+        while cause is not None:
+            traceback.clear_frames(cause.__traceback__)
+            cause = cause.__context__
+        give_back_idle(device)

@@ -9,6 +9,7 @@ pixel; where all three are one this is the paper's equation.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -108,3 +109,22 @@ class _ComposeWater(torch.autograd.Function):
         size = (alpha.numel(), ctx.threads)
         ctx.library.call("aq_compose_water_backward", *inputs, *size, *outputs)
         return (*gradients, None, None, None, None)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The sinusoidal encoding gamma of the paper (Eq. 7).
+
+BANDS = 4
+"""L in the paper."""
+
+
+def sinusoidal_encoding(
+    x: Tensor,  # [..., D]
+    bands: int = BANDS,
+) -> Tensor:
+    """[..., D (1 + 2 L)]: x, then sin and cos of 2^l pi x for l below ``bands``."""
+    parts = [x]
+    for level in range(bands):
+        angle = (2.0**level * math.pi) * x
+        parts += [torch.sin(angle), torch.cos(angle)]
+    return torch.cat(parts, dim=-1)

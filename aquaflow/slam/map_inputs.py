@@ -14,8 +14,7 @@ from aquaflow.base.stages import Stages
 from aquaflow.config import Config, MappingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.mapping.no_maps import NoMaps
-from aquaflow.mapping.work import Growth, Insertion, MapWork, OwnedMaps
+from aquaflow.mapping.work import Growth, Insertion, MapWork, NoMaps, OwnedMaps
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 

@@ -17,24 +17,21 @@ A dive is in water unless there is evidence for clear water, and the likeliest w
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import astuple, dataclass
 from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import MediumConfig, WaterPriorsConfig
-from aquaflow.water.clear import attenuation_covariance, log_odds_clear
+from aquaflow.water.exposure import WhiteBalance
 from aquaflow.water.model import BELIEVED, WaterModel
-from aquaflow.water.nearest import Nearest, nearest_of, white_balance
+from aquaflow.water.nearest import Nearest, nearest_of, white_balance, with_open_water
 from aquaflow.water.observations import Observations, variance_over_range
-from aquaflow.water.open_sightings import with_open_water
-from aquaflow.water.parameters import Model
-from aquaflow.water.posed_picture import PosedPicture
-from aquaflow.water.selection import fit_likeliest
-from aquaflow.water.solver import WaterFit
-from aquaflow.water.white_balance import WhiteBalance
+from aquaflow.water.parameters import RATE_ROWS, Model, rate_rows
+from aquaflow.water.sightings import PosedPicture
+from aquaflow.water.solver import WaterFit, descend
 
 Array = npt.NDArray[np.float64]
 
@@ -183,3 +180,150 @@ def log_odds_of_water(dry: WaterFit, wet: WaterFit) -> float:
 def _beta_a_sigma(fit: WaterFit) -> list[float]:
     variance = np.maximum(np.diag(attenuation_covariance(fit)), 0.0)
     return list(np.sqrt(variance).tolist())
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Clear water, or air: its odds against water that dims and veils what is far.
+#
+# Contrast is never quite the same from near and from far, as ranges and poses are not exact; scenes
+# without water look like one of a hundredth of an optical depth, in all colours alike. A fit that
+# finds no more than this found clear water.
+
+OPTICAL_DEPTH, OPTICAL_DEPTH_SIGMA = 0.02, 1.0
+"""At the median range, and its sigma in the log. Found on rendered dives without water (reef, flat
+sand, pipe): 0.01 to 0.05."""
+RATIO_SIGMA = 0.15
+"""Log of red over green and of blue over green: 0.02 to 0.1 on the same dives."""
+CONTRAST_SIGMA = 0.03
+"""Optical depth, at the median range, by which a scene's contrast changes without water, alike in
+RGB: of 50 rendered dives in water most change by less than 0.01, some by 0.05."""
+ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RATIO_SIGMA, RATIO_SIGMA)
+"""Whitens log beta_a of clear water."""
+LEAST_DEPTH = 1e-6
+"""Guards the division by the optical depth of water that is not there."""
+LEAST_INFORMATION = 1e-6
+"""Guards the inverse where the observations say nothing of a direction."""
+
+
+def log_odds_clear(
+    fit: WaterFit,  # with water
+) -> float:
+    """Of clear water against the water of the fit's prior: what the observations say of log beta_a
+    under the prior of the one and of the other, all as normal distributions."""
+    found, start = fit.x[:3], fit.problem.start[:3]
+    wet = RATE_ROWS.T @ RATE_ROWS
+    posterior = np.linalg.inv(attenuation_covariance(fit))
+    values, vectors = np.linalg.eigh(posterior - wet)
+    seen = (vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T
+    middle = np.linalg.solve(seen, posterior @ found - wet @ start)
+    clear = np.full(3, np.log(OPTICAL_DEPTH / fit.problem.median_range))
+    spread = np.linalg.inv(seen)
+    dry, water = np.linalg.inv(ROWS.T @ ROWS), np.linalg.inv(wet)
+    return _log_normal(middle - clear, spread + dry) - _log_normal(middle - start, spread + water)
+
+
+def attenuation_covariance(
+    fit: WaterFit,  # with water
+) -> Array:
+    """[3, 3] of log beta_a: by the observations' errors, and by CONTRAST_SIGMA."""
+    depth = np.maximum(np.exp(fit.x[:3]) * fit.problem.median_range, LEAST_DEPTH)
+    alike = CONTRAST_SIGMA / depth
+    return np.asarray(fit.repeated_covariance[:3, :3] + np.outer(alike, alike))
+
+
+def _log_normal(
+    off: Array,  # [K]
+    covariance: Array,  # [K, K]
+) -> float:
+    """Log density up to the constant that all normal distributions in K dimensions share."""
+    return float(-0.5 * (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance)[1]))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Which of shading, exposure and unevenness there are: the likeliest model with and without water.
+#
+# Only the richest models are fitted from the start. What a smaller one's marginal likelihood is
+# follows from a richer one's posterior, taken as a normal distribution: the density of the parts
+# left out at nothing, before and after the observations (Savage and Dickey's ratio). The likeliest
+# is then fitted itself.
+
+NOISE = 0.005
+"""Least colour noise of one observation, the mean over a patch."""
+FIRST_NOISE = 0.03
+"""In the first fit, which is yet to find the noise."""
+FEWEST_REPEATS, MOST_REPEATS = 1.0, 100.0
+"""Bounds of how often the same error is counted (solver.py)."""
+
+
+def fit_likeliest(problems: Sequence[WaterModel]) -> Generator[None, None, list[WaterFit]]:
+    """Of those with water and those without the likeliest each; pauses every few milliseconds.
+
+    The richest model comes first: it says how large the errors are, and where the others start.
+    """
+    richest = max(problems, key=lambda problem: problem.size)
+    first = yield from descend(richest, richest.start, FIRST_NOISE)
+    noise = max(first.spread(), NOISE)
+    first = yield from descend(richest, first.x, noise)
+    repeats = min(max(first.repetition(), FEWEST_REPEATS), MOST_REPEATS)
+    noise *= float(np.sqrt(repeats))
+    chosen = []
+    for water in (False, True):
+        some = [problem for problem in problems if problem.model.water is water]
+        if some:
+            chosen.append((yield from _likeliest(some, first, noise)))
+    return chosen
+
+
+def _likeliest(
+    problems: Sequence[WaterModel],
+    first: WaterFit,
+    noise: float,
+) -> Generator[None, None, WaterFit]:
+    """The likeliest of the problems, fitted."""
+    best: tuple[float, WaterModel, Array] | None = None
+    for rich in _richest(problems):
+        fit = yield from descend(rich, rich.adopt(first.problem, first.x), noise)
+        for problem in problems:
+            if _contains(rich, problem):
+                candidate = without(fit, problem)
+                best = candidate if best is None or candidate[0] > best[0] else best
+        yield
+    assert best is not None
+    _, problem, x = best
+    # One channel may be stuck where its backscatter grows at once: tried from two sides.
+    last = []
+    for start in (x, problem.start):
+        last.append((yield from descend(problem, start, noise)))
+    return max(last, key=lambda fit: fit.log_evidence)
+
+
+def _richest(problems: Sequence[WaterModel]) -> Iterator[WaterModel]:
+    """Those that no other contains."""
+    for problem in problems:
+        if not any(other is not problem and _contains(other, problem) for other in problems):
+            yield problem
+
+
+def _contains(rich: WaterModel, poor: WaterModel) -> bool:
+    pairs = zip(astuple(poor.model), astuple(rich.model), strict=True)
+    return all(has <= may for has, may in pairs)
+
+
+def without(fit: WaterFit, problem: WaterModel) -> tuple[float, WaterModel, Array]:
+    """Log evidence of a smaller problem by a richer one's fit, and its parameters then."""
+    kept = np.zeros(fit.problem.size, bool)
+    for mine, theirs in zip(problem.parts, fit.problem.parts, strict=True):
+        kept[theirs] = mine.stop > mine.start
+    left_out = ~kept
+    if not left_out.any():
+        return fit.log_evidence, problem, fit.x
+    _, rows = fit.problem.priors(fit.x)
+    # What is left out has a prior of its own, of mean zero.
+    prior = (rows.T @ rows)[np.ix_(left_out, left_out)]
+    covariance = fit.covariance
+    block = covariance[np.ix_(left_out, left_out)]
+    off = fit.x[left_out]
+    pull = np.linalg.solve(block, off)
+    log_ratio = -0.5 * (off @ pull + np.linalg.slogdet(block)[1] + np.linalg.slogdet(prior)[1])
+    x = fit.x[kept] - covariance[np.ix_(kept, left_out)] @ pull
+    return fit.log_evidence + float(log_ratio), problem, x

@@ -30,7 +30,7 @@ from tests.pretended_device import PRETENDED
 
 KERNELS = ("photometric", "view_loss", "water", "adam", "activation")
 FITTED = tuple(f"aquaflow.render.{name}" for name in KERNELS)
-DECODE = "aquaflow.mapping.neural.decode"
+DECODE = "aquaflow.mapping.neural.decoder"
 """Modules that take the compiled kernels where there are any."""
 
 ALL_PARTS: dict[str, dict[str, Any]] = {

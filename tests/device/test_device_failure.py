@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aquaflow.mapping.host_copies import COPY_EVERY
+from aquaflow.mapping.device_work import COPY_EVERY
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU

@@ -10,7 +10,7 @@ import torch
 
 from aquaflow.mapping.device_work import MOST_LEFT_OUT
 from aquaflow.mapping.mapper import MOST_FULL
-from aquaflow.render.device_memory import usable_share
+from aquaflow.render.gsplat import usable_share
 from tests.device.failing_dives import (
     VIEWS,
     assert_goes_on,

@@ -12,8 +12,8 @@ from aquaflow.config.service import LiveMappingConfig
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.live.map_thread import MapThread
-from aquaflow.mapping.map_copy import MapCopy, copy_map
 from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.state import MapCopy, copy_map
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
 from tests.device.device_scenes import SMALL, SinglePrecision, everything

@@ -11,8 +11,8 @@ import torch
 from aquaflow.api.map import Map
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.mapping import state
-from aquaflow.mapping.map_copy import copy_map
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.state import copy_map
 from aquaflow.render.contract import CPU
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.survey.viewer.live_viewer import pack_for_browser

@@ -12,7 +12,7 @@ from rich.console import Console
 from aquaflow.doctor import CheckResult, MachineProbes, print_findings, to_json
 from aquaflow.doctor import machine as accelerator
 from aquaflow.doctor.attempts import Attempt
-from aquaflow.render.gpu import Gpu
+from aquaflow.render.gsplat import Gpu
 
 ORIN = Gpu("Orin", "8.7", 7.4, "2.8.0", "12.6", ("sm_87",))
 DREW = Attempt(

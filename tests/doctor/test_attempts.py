@@ -18,10 +18,11 @@ from aquaflow.doctor import attempts
 from aquaflow.doctor.attempts import Attempt, apart, draw, infer
 from aquaflow.prior import runtime
 from aquaflow.prior.runtime import PROVIDERS
-from aquaflow.render import example_scene, gpu
+from aquaflow.render import example_scene
+from aquaflow.render import gsplat as gpu
 from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.example_scene import Size
-from aquaflow.render.gpu import Gpu, gpu_here
+from aquaflow.render.gsplat import Gpu, gpu_here
 from aquaflow.render.reference import ReferenceRenderer
 from tests.device.device_scenes import SinglePrecision
 from tests.pretended_device import PRETENDED, pretended_device

@@ -83,7 +83,7 @@ def test_other_systems_are_said_not_to_be(machine, architecture):
 
 
 def test_the_gpu_probe_needs_no_torch(monkeypatch):
-    monkeypatch.setitem(sys.modules, "aquaflow.render.gpu", None)
+    monkeypatch.setitem(sys.modules, "aquaflow.render.gsplat", None)
 
     assert MachineProbes().gpu() == "torch is not installed"
 

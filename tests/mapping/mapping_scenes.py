@@ -14,17 +14,16 @@ from aquaflow.config import MappingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
+from aquaflow.mapping.gaussians import GaussianMap, raw_colour
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.rendering import show
-from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene import Scene, show
 from aquaflow.mapping.scene_water import adopt_water, fitting_water
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 from aquaflow.render.views import View
 from aquaflow.water.estimation import WaterEstimate
-from aquaflow.water.image_formation import WaterParameters
-from aquaflow.water.pauses import run_to_end
+from aquaflow.water.medium import WaterParameters
+from aquaflow.water.observations import run_to_end
 
 Array = npt.NDArray[np.float64]
 

@@ -12,13 +12,17 @@ from aquaflow.config import Config, MappingConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.water_summary import summarise_water
-from aquaflow.mapping.clear_colours import mean_water, restored_gaussians, restored_radiance
-from aquaflow.mapping.map_copy import copy_map
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import drawn_without_water
-from aquaflow.render.activation import radiance
+from aquaflow.mapping.restoration import (
+    drawn_without_water,
+    mean_water,
+    restored_gaussians,
+    restored_radiance,
+)
+from aquaflow.mapping.state import copy_map
+from aquaflow.render.contract import radiance
 from aquaflow.telemetry.world_frame import WorldFrame
-from aquaflow.water.white_balance import WhiteBalance
+from aquaflow.water.exposure import WhiteBalance
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of
 
 WATER = ((0.9, 0.15, 0.1), (0.05, 0.25, 0.3), (0.5, 0.3, 0.2))

@@ -12,7 +12,7 @@ import pytest
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config import Config
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.maps import Maps
 from aquaflow.render.adam import SelectiveAdam

@@ -8,9 +8,7 @@ import torch
 
 from aquaflow.config import InsertionConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import GaussianMap
-from aquaflow.mapping.gaussians.insertion import new_gaussians
-from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
+from aquaflow.mapping.gaussians import GaussianMap, move_gaussians, move_views, new_gaussians
 from aquaflow.render.views import View, refine_pose
 from aquaflow.water.exposure import learn_gain, set_log_gains
 from aquaflow.water.sunlight import learn_light

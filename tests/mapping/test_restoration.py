@@ -7,16 +7,15 @@ import pytest
 import torch
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
     common_exposure,
     drawn_without_water,
     restored_picture,
     to_bytes,
 )
-from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.views import View
-from aquaflow.water.white_balance import WhiteBalance
+from aquaflow.water.exposure import WhiteBalance
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 BRIGHTER_ABOVE = torch.tensor([0.1, -0.6, -0.1, 0.0, 0.2])

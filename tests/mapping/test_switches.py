@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from aquaflow.config import InsertionConfig, MediumConfig
-from aquaflow.mapping.gaussians.insertion import colour_range, select
+from aquaflow.mapping.gaussians import colour_range, select
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import orientations
 from aquaflow.water.estimation import models_for

@@ -11,11 +11,10 @@ import torch
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MediumConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping import water_fitting as module
+from aquaflow.mapping import scene_water as module
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.scene_water import fitting_water
-from aquaflow.mapping.water_fitting import STEPS, WaterFitting
+from aquaflow.mapping.scene_water import STEPS, WaterFitting, fitting_water
 from aquaflow.render.views import View
 from aquaflow.water.estimation import WaterEstimate
 from tests.mapping.mapping_scenes import filmed, floor, pose, renderer, settings, view_of, water
@@ -118,7 +117,7 @@ def submerged() -> Mapper:
 
 def test_a_fit_to_the_maps_own_views_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     mapper = submerged()
-    with caplog.at_level("INFO", logger="aquaflow.mapping.water_fitting"):
+    with caplog.at_level("INFO", logger="aquaflow.mapping.scene_water"):
         mapper.water_fitting.at_once(mapper.views)
     assert "water fitted" in caplog.text
     assert mapper.scene.beta_a_sigma is not None

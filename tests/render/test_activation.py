@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.render.activation import COLOUR_SHARPNESS, activate, activate_torch, radiance
+from aquaflow.render.contract import COLOUR_SHARPNESS, activate, activate_torch, radiance
 from aquaflow.render.library import library_or_none
 
 CENTRE = torch.tensor([0.3, -0.2, 0.1])

@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.render.activity import active_pixels, touches_active
-from aquaflow.render.contract import TILE_PX, Renderer, tile_grid
-from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.contract import TILE_PX, Renderer, active_pixels, tile_grid, touches_active
+from aquaflow.render.cpu import CpuRenderer, TileRenderer
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
-from aquaflow.render.tiles import TileRenderer
 from tests.render.render_scenes import (
     HEIGHT,
     NAMES,

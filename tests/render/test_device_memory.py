@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from aquaflow.render.contract import CPU
-from aquaflow.render.device_memory import usable_share
+from aquaflow.render.gsplat import usable_share
 from tests.pretended_allocator import Allocator, asked_through_torch
 
 CUDA = torch.device("cuda")

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.render.encoding import BANDS, sinusoidal_encoding
+from aquaflow.render.water import BANDS, sinusoidal_encoding
 
 numbers = st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9)
 

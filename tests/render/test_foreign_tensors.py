@@ -11,12 +11,11 @@ from torch import Tensor
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
-from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.cpu import CpuRenderer, TileRenderer
 from aquaflow.render.library import library_or_none
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.tensor_address import pointer
-from aquaflow.render.tiles import TileRenderer
 from aquaflow.render.water import compose_water
 from tests.render.render_scenes import HEIGHT, WIDTH, random_scene
 

@@ -10,8 +10,14 @@ import pytest
 from aquaflow.render import cpu_renderer
 from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.example_scene import NAMES, SMALL, Size, height_field
-from aquaflow.render.parity import MOST_GRADIENT, MOST_PICTURE, PICTURE, differences, too_far
-from aquaflow.render.reference import ReferenceRenderer
+from aquaflow.render.reference import (
+    MOST_GRADIENT,
+    MOST_PICTURE,
+    PICTURE,
+    ReferenceRenderer,
+    differences,
+    too_far,
+)
 
 TINY = height_field(Size(60, 40, 30))
 

@@ -12,11 +12,10 @@ import torch
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import contract
 from aquaflow.render.contract import Renderer, Rendering
-from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.cpu import CpuRenderer, TileRenderer
 from aquaflow.render.library import STAGES, load_library
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
-from aquaflow.render.tiles import TileRenderer
 from tests.render.render_scenes import (
     HEIGHT,
     NAMES,

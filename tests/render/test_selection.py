@@ -11,9 +11,8 @@ import pytest
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import library, select_renderer
-from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.cpu import CpuRenderer, TileRenderer
 from aquaflow.render.native import build as native
-from aquaflow.render.tiles import TileRenderer
 from tests.render.render_scenes import HEIGHT, WIDTH, random_scene
 
 needs_compiler = pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")

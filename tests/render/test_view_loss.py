@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.render.view_loss import (
+from aquaflow.render.photometric import (
     MIN_RANGE,
     depth_loss,
     depth_loss_torch,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
-from aquaflow.mapping.rendering import show
+from aquaflow.mapping.scene import show
 from aquaflow.render.contract import Renderer
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.views import BETAS, View, refine_pose

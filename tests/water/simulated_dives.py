@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.lab.synthetic.water import WATER_TYPES
 from aquaflow.water.observations import Observations
-from aquaflow.water.shading import shading_basis
+from aquaflow.water.parameters import shading_basis
 
 Array = npt.NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.water.regions import FEWEST, RegionalColours, regions_of
+from aquaflow.water.observations import FEWEST, RegionalColours, regions_of
 from tests.water.decision_table import kinds, row
 from tests.water.simulated_dives import Kind, dive
 from tests.water.water_observations import fitted, sighted

@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from aquaflow.config import MediumConfig
-from aquaflow.water.clear import CONTRAST_SIGMA
-from aquaflow.water.estimation import EVERY_MODEL, MIN_POINTS, WaterEstimate, estimating, models_for
+from aquaflow.water.estimation import (
+    CONTRAST_SIGMA,
+    EVERY_MODEL,
+    MIN_POINTS,
+    WaterEstimate,
+    estimating,
+    models_for,
+    without,
+)
 from aquaflow.water.model import WaterModel
-from aquaflow.water.observations import Observations
-from aquaflow.water.parameters import Model
-from aquaflow.water.pauses import run_to_end
-from aquaflow.water.selection import without
-from aquaflow.water.shading import TERMS, shading_basis
+from aquaflow.water.observations import Observations, run_to_end
+from aquaflow.water.parameters import TERMS, Model, shading_basis
 from aquaflow.water.solver import cost, descend
 from tests.water.water_observations import (
     B_INF,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from aquaflow.render.water import compose_water
-from aquaflow.water.image_formation import MAX_RESTORED, MIN_TRANSMISSION, WaterParameters
+from aquaflow.water.medium import MAX_RESTORED, MIN_TRANSMISSION, WaterParameters
 from tests.mapping.mapping_scenes import water
 
 

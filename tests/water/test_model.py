@@ -10,8 +10,7 @@ import pytest
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.water.model import WaterModel
 from aquaflow.water.observations import Observations
-from aquaflow.water.parameters import EXPOSURE_SIGMA, Model
-from aquaflow.water.shading import TERMS
+from aquaflow.water.parameters import EXPOSURE_SIGMA, TERMS, Model
 from aquaflow.water.solver import normal_equations
 from tests.water.water_observations import B_RES, D
 

@@ -12,10 +12,10 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water.estimation import estimating
-from aquaflow.water.open_sightings import COLUMNS, ROWS, with_open_water
+from aquaflow.water.nearest import COLUMNS, ROWS, with_open_water
+from aquaflow.water.observations import run_to_end
 from aquaflow.water.parameters import Trial
-from aquaflow.water.pauses import run_to_end
-from aquaflow.water.posed_picture import PosedPicture
+from aquaflow.water.sightings import PosedPicture
 from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=80.0, cy=60.0)

@@ -11,10 +11,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water import sightings
-from aquaflow.water.observations import Observations
-from aquaflow.water.pauses import run_to_end
-from aquaflow.water.posed_picture import PosedPicture
-from aquaflow.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, sighting
+from aquaflow.water.observations import Observations, run_to_end
+from aquaflow.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, PosedPicture, sighting
 
 Array = npt.NDArray[np.float64]
 

@@ -57,7 +57,7 @@ def _processor() -> str:
 
 
 def _gpu() -> str:
-    from aquaflow.render.gpu import gpu_here
+    from aquaflow.render.gsplat import gpu_here
 
     return str(gpu_here())
 

@@ -8,7 +8,7 @@ import torch
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import gsplat
-from aquaflow.render.gpu import gpu_here
+from aquaflow.render.gsplat import gpu_here
 
 DEVICES = ("cpu", "cuda")
 """Where maps can be drawn and optimised while a benchmark looks."""

@@ -12,7 +12,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.lab.stress.case import Check, case
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer, Rendering
-from aquaflow.render.tiles import TileRenderer
+from aquaflow.render.cpu import TileRenderer
 
 CAMERA = CameraModel(32, 24, 28.0, 28.0, 16.0, 12.0)
 COUNT = 24

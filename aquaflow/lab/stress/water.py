@@ -9,12 +9,11 @@ from torch import Tensor
 
 from aquaflow.config import MediumConfig
 from aquaflow.lab.stress.case import Check, case
-from aquaflow.mapping.gaussians.gaussians import raw_colour
-from aquaflow.render.activation import radiance
-from aquaflow.render.view_loss import depth_loss
+from aquaflow.mapping.gaussians import raw_colour
+from aquaflow.render.contract import radiance
+from aquaflow.render.photometric import depth_loss
 from aquaflow.render.water import compose_water, compose_water_torch
-from aquaflow.water.image_formation import WaterParameters
-from aquaflow.water.medium import LearnedMedium
+from aquaflow.water.medium import LearnedMedium, WaterParameters
 
 RATES = (0.0, 1e-8, 0.01, 0.5, 5.0, 50.0)
 """1/m"""

@@ -14,12 +14,12 @@ from aquaflow.dive.ply import PlyGaussians
 from aquaflow.dive.point_cloud import PointCloud, PosedView, posed_views
 from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
-from aquaflow.mapping.map_copy import MapCopy, copy_map
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import common_exposure, drawn_without_water, to_bytes
+from aquaflow.mapping.state import MapCopy, copy_map
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
-from aquaflow.water.image_formation import WaterParameters
+from aquaflow.water.medium import WaterParameters
 
 Picture = npt.NDArray[np.uint8]
 

@@ -21,9 +21,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aquaflow.config.mapping import DecoderConfig
-from aquaflow.mapping.gaussians.reanchoring import quaternion_product
-from aquaflow.mapping.neural.observation import encoded_observation, encoded_width, is_sound
-from aquaflow.mapping.neural.tokens import Tokens
+from aquaflow.mapping.gaussians import quaternion_product
+from aquaflow.mapping.neural.voxel_groups import EMPTY, VoxelGroups
+from aquaflow.render.contract import NEAR_PLANE_M
+from aquaflow.render.decoding import ViewWeights, decode_view, takes
+from aquaflow.render.library import library_or_none
+from aquaflow.render.transfers import groups_in, groups_out
+from aquaflow.render.views import View
+from aquaflow.render.water import BANDS, sinusoidal_encoding
 
 LARGEST_FEATURE = 1e4
 """A feature beyond this, or no number, is unsound: its group is decoded to no residual."""
@@ -236,3 +241,231 @@ def _zero_linear(inputs: int, outputs: int) -> nn.Linear:
     for weight in layer.parameters():
         nn.init.zeros_(weight)
     return layer
+
+
+# --- ----------------------------------------------------------------------------------------------
+# View-dependent attributes of Gaussians: initial attributes plus decoded residuals.
+#
+# One view at a time goes through the compiled kernel; :func:`decoded_torch` is its definition, the
+# fallback, and what knows a camera for each Gaussian.
+
+DECODED = ("quats", "log_scales", "raw_colours")
+"""Names of the parameters that get residuals."""
+
+MARGIN = 0.3
+"""Share of the picture's size by which a centre may lie outside and still be decoded."""
+
+
+@torch.no_grad()
+def in_picture(
+    means: Tensor,  # [N, 3] world
+    view: View,
+    viewmat: Tensor,  # [4, 4]
+) -> Tensor:
+    """[N] bool: the Gaussian's centre is in the picture, or not far outside it."""
+    x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
+    camera, front = view.camera, z > NEAR_PLANE_M
+    z = torch.where(front, z, 1.0)
+    half_width, half_height = 0.5 * camera.width, 0.5 * camera.height
+    across = (camera.fx * x / z + camera.cx - half_width).abs()
+    down = (camera.fy * y / z + camera.cy - half_height).abs()
+    reach = 1.0 + 2.0 * MARGIN
+    return front & (across < reach * half_width) & (down < reach * half_height)
+
+
+def decode(
+    decoder: Decoder,
+    trunk: Trunk,
+    parameters: Mapping[str, Tensor],  # of a GaussianMap
+    places: Tensor,  # [V] int64 places of trunk.tokens
+    centre: Tensor,  # [3] of the camera
+    threads: int,
+) -> dict[str, Tensor]:
+    """The parameters with residuals on those in ``places``; differentiable but for the places."""
+    on_cpu = trunk.hidden.device.type == "cpu"
+    library = library_or_none() if on_cpu and takes(decoder.config.width) else None
+    if library is None:
+        return decoded_torch(decoder, trunk, parameters, places, centre)
+    if trunk.sound is not None:
+        places = places[trunk.sound[places]]
+    weights = ViewWeights(
+        decoder.weight_in_heads(),
+        torch.cat([decoder.geometry.weight, decoder.colour.weight]),
+        torch.cat([decoder.geometry.bias, decoder.colour.bias]),
+        decoder.limits,
+    )
+    quats, log_scales, raw_colours = decode_view(
+        (parameters["quats"], parameters["log_scales"], parameters["raw_colours"]),
+        trunk.hidden,
+        weights,
+        trunk.tokens.rows[places],
+        places,
+        parameters["means"],
+        centre,
+        threads,
+        library,
+    )
+    changed = {"quats": quats, "log_scales": log_scales, "raw_colours": raw_colours}
+    return {**parameters, **changed}
+
+
+def decoded_torch(
+    decoder: Decoder,
+    trunk: Trunk,
+    parameters: Mapping[str, Tensor],  # of a GaussianMap
+    places: Tensor,  # [V] int64
+    centre: Tensor,  # [3], or [V, 3]
+) -> dict[str, Tensor]:
+    """Reference implementation of :func:`decode` in torch."""
+    rows = trunk.tokens.rows[places]
+    o = observation(parameters["means"].detach()[rows], centre)
+    return apply_residuals(parameters, rows, decoder.residuals(trunk, places, o))
+
+
+def without_residuals(
+    wanted: Mapping[str, Tensor],  # DECODED [V, ...], as they are to be seen
+    residuals: Tensor,  # [V, 9]
+) -> dict[str, Tensor]:
+    """The initial attributes that residuals turn into ``wanted``."""
+    u, log_scales, colours = residuals.split_with_sizes([TURN, LOG_SCALE, 3], dim=1)
+    back = F.normalize(F.pad(-u, (1, 0), value=1.0), dim=1)
+    return {
+        "quats": quaternion_product(wanted["quats"], back),
+        "log_scales": wanted["log_scales"] - log_scales,
+        "raw_colours": wanted["raw_colours"] - colours,
+    }
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Voxel groups laid out for a decoder: groups of about the same fill side by side.
+
+BUCKET = 4
+"""Places in a bucket's groups are a multiple of this; padding is 10 % of the tokens on real maps
+(the powers of two: 19 %)."""
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """The Gaussians of some groups, one place each, and padding."""
+
+    rows: Tensor
+    """[P] int64 Gaussian of each place; padding repeats the group's first one."""
+    valid: Tensor
+    """[P] bool: not padding."""
+    groups: Tensor
+    """[B] int64 groups in the order of the places."""
+    buckets: tuple[tuple[int, int], ...]
+    """(groups, places a group) of each bucket, in the order of the places."""
+
+    @property
+    def sizes(self) -> list[int]:
+        """Places of each bucket."""
+        return [count * width for count, width in self.buckets]
+
+    @property
+    def places_of_groups(self) -> Tensor:
+        """[B] int64 places of each group."""
+        flat = groups_in([number for bucket in self.buckets for number in bucket], self.rows.device)
+        counts, widths = flat.reshape(-1, 2).unbind(1)
+        return widths.repeat_interleave(counts)
+
+    def places(
+        self,
+        visible: Tensor,  # [N] bool
+    ) -> Tensor:
+        """[V] int64 places of the visible Gaussians."""
+        return torch.nonzero(self.valid & visible[self.rows])[:, 0]
+
+
+def visible_tokens(
+    groups: VoxelGroups,
+    visible: Tensor,  # [N] bool
+) -> Tokens:
+    """All Gaussians of the groups of which one is visible: its neighbours are its context."""
+    seen = torch.zeros(len(groups), dtype=torch.int64, device=groups.device)
+    chosen = torch.nonzero(seen.index_add_(0, groups.group, visible.long()))[:, 0]
+    units = (groups.fill[chosen] + BUCKET - 1).div(BUCKET, rounding_mode="floor")
+    units, order = torch.sort(units, stable=True)
+    chosen, buckets = chosen[order], _buckets(groups, units)
+    tables = [chosen[:0]]
+    members = chosen.split_with_sizes([count for count, _ in buckets])
+    for (_, width), each in zip(buckets, members, strict=True):
+        tables.append(_table(groups, each, width).reshape(-1))
+    table = torch.cat(tables)
+    first = groups.table[chosen, 0].repeat_interleave(units * BUCKET, output_size=len(table))
+    valid = table != EMPTY
+    return Tokens(torch.where(valid, table, first), valid, chosen, buckets)
+
+
+def _buckets(
+    groups: VoxelGroups,
+    units: Tensor,  # [B] int64 places of each group, in multiples of BUCKET
+) -> tuple[tuple[int, int], ...]:
+    """(groups, places a group), of the groups that are laid out; the host has to know."""
+    most = -(-groups.table.shape[1] // BUCKET)
+    counts = torch.zeros(most + 1, dtype=torch.int64, device=units.device)
+    counts.index_add_(0, units, torch.ones_like(units))
+    return tuple((n, BUCKET * unit) for unit, n in enumerate(groups_out(counts)) if n > 0)
+
+
+def _table(
+    groups: VoxelGroups,
+    members: Tensor,  # [B]
+    width: int,
+) -> Tensor:
+    """[B, width] rows; -1 in free places, of which a bucket may have more than a group has."""
+    table = groups.table[members, :width]
+    return torch.nn.functional.pad(table, (0, width - table.shape[1]), value=EMPTY)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The observation condition o = [v, d]: from where, and how far, a Gaussian is seen.
+#
+# Paper, Eq. 5 and 6. Gradients stop here: through the highest octave a step of the optimiser would
+# move Gaussians and cameras only to change the decoder's input.
+
+FURTHEST = 16.0
+"""Distances beyond count as this, in scene scales: sixteen times the usual range, the water is
+opaque by then, and the encoding stays bounded."""
+
+NEAREST = 1e-6
+"""Distance, in scene scales, below which there is no direction: v is shorter than one."""
+
+
+def encoded_width(distance: bool) -> int:
+    """Numbers that :func:`encoded_observation` gives for each Gaussian."""
+    return (4 if distance else 3) * (1 + 2 * BANDS)
+
+
+@torch.no_grad()
+def observation(
+    means: Tensor,  # [V, 3] world, map units
+    centre: Tensor,  # [3] or [V, 3] world, camera centre
+    scene_scale: float = 1.0,
+) -> Tensor:
+    """[V, 4] unit direction from camera to Gaussian and distance in ``scene_scale`` map units.
+
+    A place that is not finite gives numbers that are not finite; :func:`is_sound` finds them.
+    """
+    ray = (means - centre) / scene_scale
+    d = torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+    return torch.cat([ray / d.clamp_min(NEAREST), d.clamp_max(FURTHEST)], dim=-1)
+
+
+def is_sound(
+    o: Tensor,  # [V, 4]
+) -> Tensor:
+    """[V] bool: the observation can be encoded."""
+    return torch.isfinite(o.sum(dim=-1))
+
+
+def encoded_observation(
+    o: Tensor,  # [V, 4]
+    distance: bool = True,
+) -> Tensor:
+    """[V, 36] gamma(o) with L = 4; [V, 27] of the direction alone without ``distance``.
+
+    Zeros in place of what is not sound.
+    """
+    known = torch.where(is_sound(o)[:, None], o, 0.0)
+    return sinusoidal_encoding(known if distance else known[:, :3])

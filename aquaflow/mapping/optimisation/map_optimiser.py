@@ -7,20 +7,20 @@ dropped through it.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from aquaflow.config import MappingConfig, OptimiserConfig
-from aquaflow.mapping.neural.decode import DECODED
-from aquaflow.mapping.optimisation.objective import Objective
-from aquaflow.mapping.optimisation.schedule import Rates
-from aquaflow.mapping.rendering import RenderedMap
-from aquaflow.mapping.scene import Scene
+from aquaflow.config import LossConfig, MappingConfig, OptimiserConfig
+from aquaflow.mapping.neural.decoder import DECODED
+from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.adam import SelectiveAdam
-from aquaflow.render.contract import TILE_PX
+from aquaflow.render.contract import CPU, TILE_PX, active_pixels
 from aquaflow.render.dense_adam import DenseAdam
+from aquaflow.render.photometric import depth_loss, outlier_mask, photometric_loss
 from aquaflow.render.views import View, refine_pose
 
 log = logging.getLogger(__name__)
@@ -237,3 +237,128 @@ def record_explained(
         tiles = F.avg_pool2d(error[None], TILE_PX, ceil_mode=True)[0]
         view.explained, view.all_explained = tiles < config.noise_floor, None
     view.looks += 1
+
+
+# --- ----------------------------------------------------------------------------------------------
+# L_total of one view (paper, Eq. 19).
+
+
+class Objective:
+    """The weighted sum of the paper's terms; keeps K_rad for every size of picture."""
+
+    def __init__(self, config: LossConfig, threads: int) -> None:
+        self.config, self.threads = config, threads
+        self._K_rad: dict[tuple[int, int], Tensor] = {}
+
+    def total(
+        self,
+        view: View,
+        shown: RenderedMap,
+        parameters: Mapping[str, Tensor],  # of a GaussianMap
+    ) -> Tensor:
+        """L1, SSIM, depth and scale terms of ``shown``, the map drawn from ``view``."""
+        config, target = self.config, view.target()
+        mask = view.scene_mask()
+        if shown.active is not None:
+            mask &= active_pixels(shown.active, view.camera.width, view.camera.height)
+        if view.robust:
+            image, K_rad = shown.image, self.radial(view)
+            mask &= outlier_mask(image, target, K_rad, config.tau_e, self.threads)
+        loss = self._pictures(view, shown, target, mask)
+        inverse_range = view.inverse_range
+        if config.depth > 0.0 and inverse_range is not None:
+            assert view.range_confidence is not None
+            trust = self.radial(view) * mask * view.range_confidence
+            # The view's ranges are in its keyframe's unit; the map is in the world's.
+            expected = inverse_range / view.T_wc.scale
+            ranges = depth_loss(shown.z, shown.alpha, expected, trust, self.threads)
+            loss = loss + config.depth * ranges
+        if config.scale > 0.0:
+            loss = loss + config.scale * scale_loss(parameters["log_scales"])
+        return loss
+
+    def _pictures(
+        self,
+        view: View,
+        shown: RenderedMap,
+        target: Tensor,  # [H, W, 3]
+        mask: Tensor,  # [H, W] bool
+    ) -> Tensor:
+        return photometric_loss(
+            shown.image, target, self.radial(view), mask, self.config.ssim, self.threads
+        )
+
+    def radial(self, view: View) -> Tensor:
+        """K_rad [H, W]."""
+        size = (view.camera.height, view.camera.width)
+        if size not in self._K_rad:
+            self._K_rad[size] = radial_weight(*size, view.device)
+        return self._K_rad[size]
+
+
+# --- ----------------------------------------------------------------------------------------------
+# What the loss needs beside the terms of a view that the renderer has: K_rad, and Eq. 23.
+
+RADIAL_VARIANCE = 5.0
+"""sigma^2 of K_rad in units of the half picture: corner weight 0.82 (ARTDECO; docs/paper.md)."""
+
+
+def radial_weight(height: int, width: int, device: torch.device = CPU) -> Tensor:
+    """K_rad [H, W] = exp(-r^2 / (2 sigma^2)), r in [-1, 1]^2 picture coordinates."""
+    y = torch.linspace(-1.0, 1.0, height, device=device)[:, None]
+    x = torch.linspace(-1.0, 1.0, width, device=device)[None, :]
+    return torch.exp(-(x * x + y * y) / (2.0 * RADIAL_VARIANCE)).contiguous()
+
+
+def scale_loss(
+    log_scales: Tensor,  # [N, 3]
+) -> Tensor:
+    """L_scale: mean volume, which keeps Gaussians from growing over what they do not explain."""
+    return torch.exp(log_scales.sum(dim=-1)).mean()
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Selects the view of each optimiser step, and how far it goes (paper, Sec. 3.4).
+
+
+def sampled_views(
+    views: Sequence[View],
+    steps: int,
+    newest_share: float,
+    generator: torch.Generator,
+) -> list[View]:
+    """One view for each step during the dive: sometimes the newest, else a random one."""
+    chosen = []
+    for _ in range(steps if views else 0):
+        newest = torch.rand((), generator=generator) < newest_share
+        index = int(torch.randint(len(views), (), generator=generator))
+        chosen.append(views[-1 if newest else index])
+    return chosen
+
+
+def shuffled_views(views: Sequence[View], steps: int, generator: torch.Generator) -> list[View]:
+    """One view a step after the dive: all of them in random order, then again in another."""
+    order: list[int] = []
+    while views and len(order) < steps:
+        order += reversed(torch.randperm(len(views), generator=generator).tolist())
+    return [views[index] for index in order[:steps]]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Factors of the learning rates."""
+
+    means: float
+    others: float
+
+
+def refining_rates(done: float, config: OptimiserConfig) -> Rates:
+    """The rates after the share ``done`` of refining.
+
+    Those of the means fall from the start. At the end all fall: what each view pulls its own way
+    settles at the mean of the views.
+    """
+    left = 1.0 - config.settle_share
+    settling = max(done - left, 0.0) / config.settle_share if config.settle_share else 0.0
+    others = config.settle_final**settling
+    return Rates(config.means_final**done * others, others)

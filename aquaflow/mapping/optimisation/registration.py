@@ -19,7 +19,7 @@ from torch import Tensor
 
 from aquaflow.config import OptimiserConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.mapping.optimisation.losses import radial_weight
+from aquaflow.mapping.optimisation.map_optimiser import radial_weight
 from aquaflow.mapping.scene import Scene
 from aquaflow.render.transfers import pose_in, registration_out
 from aquaflow.render.views import View

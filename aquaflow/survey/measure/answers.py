@@ -24,7 +24,7 @@ from aquaflow.survey.measure.roughness import MATCH_SIGMA, surface_ratio
 from aquaflow.survey.measure.scale import Scale, scale_of
 from aquaflow.survey.measure.shapes import LEAST_CORNERS, area, path_length, plan_area
 from aquaflow.telemetry.world_frame import WorldFrame
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.sightings import SOLID
 
 Array = npt.NDArray[np.float64]
 Shape = Literal["line", "area", "profile"]

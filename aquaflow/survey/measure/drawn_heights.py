@@ -18,7 +18,7 @@ from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.survey.measure.height_field import Array, Counts, HeightField, Held
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.sightings import SOLID
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it, and how much there is."""

@@ -34,7 +34,7 @@ from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel
 
 if TYPE_CHECKING:
-    from aquaflow.mapping.map_copy import MapCopy  # it loads torch
+    from aquaflow.mapping.state import MapCopy  # it loads torch
 
 PICTURE_WIDTH_PX = 240
 """px of the camera's current picture: some kB at each pose."""
@@ -107,7 +107,7 @@ class LiveViewer(DiveView):
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            from aquaflow.mapping.map_copy import copy_map  # torch, which has made the map
+            from aquaflow.mapping.state import copy_map  # torch, which has made the map
 
             self._copies.put((sub_map, copy_map(mapper)))
 

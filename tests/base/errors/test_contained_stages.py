@@ -19,7 +19,7 @@ from aquaflow.dive import replay
 from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import Finished
-from aquaflow.mapping import water_fitting
+from aquaflow.mapping import scene_water as water_fitting
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
 from aquaflow.prior.classical import ClassicalPrior

@@ -33,7 +33,7 @@ from aquaflow.lab.bench.table import markdown
 from aquaflow.render import gsplat
 from aquaflow.render.contract import CPU
 from aquaflow.render.example_scene import Size, height_field
-from aquaflow.render.gpu import Gpu
+from aquaflow.render.gsplat import Gpu
 from tests.command_line import Cli, refused
 from tests.device.device_scenes import SinglePrecision, without_kernels
 from tests.lab.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock

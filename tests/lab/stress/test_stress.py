@@ -16,15 +16,17 @@ from aquaflow.geometry import two_view as triangulation
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.stress import suite, swim
 from aquaflow.lab.stress.case import REGISTRY, Check
-from aquaflow.mapping.gaussians import gaussians
+from aquaflow.mapping import gaussians
 from aquaflow.mapping.optimisation import map_optimiser
 from aquaflow.optimise.least_squares import NormalEquations
 from aquaflow.prior import flow, homography
-from aquaflow.render import adam, reference, view_loss, views, water
+from aquaflow.render import adam, reference, views, water
+from aquaflow.render import photometric as view_loss
 from aquaflow.sources import preprocessing
 from aquaflow.tracking import current_keyframe
 from aquaflow.tracking.initialisation import bundle, initialiser
-from aquaflow.water import image_formation, medium
+from aquaflow.water import medium
+from aquaflow.water import medium as image_formation
 from tests.command_line import Cli, refused
 
 INFINITY = float("inf")

@@ -9,7 +9,7 @@ import torch
 
 from aquaflow.dive.map_file import write_map_file
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import raw_colour
+from aquaflow.mapping.gaussians import raw_colour
 from aquaflow.mapping.mapper import Mapper
 from tests.mapping.mapping_scenes import CAMERA, floor, path, renderer, settings, view_of
 

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
-from aquaflow.render.activation import radiance
+from aquaflow.mapping.gaussians import GaussianMap, raw_colour
+from aquaflow.render.contract import radiance
 
 
 def numbered(start: int, count: int) -> dict[str, torch.Tensor]:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from aquaflow.config import InsertionConfig
-from aquaflow.mapping.gaussians.insertion import (
+from aquaflow.mapping.gaussians import (
     COVERED_ALPHA,
     MAX_SPACING_WIDTHS,
     SCALE_OF_SPACING,
@@ -19,7 +19,7 @@ from aquaflow.mapping.gaussians.insertion import (
     structure,
     thin,
 )
-from aquaflow.render.activation import radiance
+from aquaflow.render.contract import radiance
 from tests.mapping.mapping_scenes import CAMERA, pose, view_of
 
 SIZE = (CAMERA.height, CAMERA.width)

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
-from aquaflow.mapping.gaussians.gaussians import GaussianMap
-from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views, quaternion_product
+from aquaflow.mapping.gaussians import GaussianMap, move_gaussians, move_views, quaternion_product
 from aquaflow.mapping.mapper import Mapper
 from tests.mapping.mapping_scenes import (
     cloud,

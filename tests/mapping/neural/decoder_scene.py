@@ -8,9 +8,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import DecoderConfig
-from aquaflow.mapping.neural.decoder import Decoder
-from aquaflow.mapping.neural.observation import observation
-from aquaflow.mapping.neural.tokens import Tokens, visible_tokens
+from aquaflow.mapping.neural.decoder import Decoder, Tokens, observation, visible_tokens
 from aquaflow.mapping.neural.voxel_groups import VoxelGroups
 
 ROWS = 23

@@ -11,16 +11,17 @@ import torch
 from numpy import uint8, zeros
 from torch import Tensor
 
-from aquaflow.mapping.neural.decode import (
+from aquaflow.mapping.neural.decoder import (
     DECODED,
+    Decoder,
+    Trunk,
     decode,
     decoded_torch,
     in_picture,
+    observation,
+    visible_tokens,
     without_residuals,
 )
-from aquaflow.mapping.neural.decoder import Decoder, Trunk
-from aquaflow.mapping.neural.observation import observation
-from aquaflow.mapping.neural.tokens import visible_tokens
 from aquaflow.render.library import library_or_none
 from tests.mapping.mapping_scenes import CAMERA, path, view_of
 from tests.mapping.neural.decoder_scene import ROWS, Scene

@@ -12,11 +12,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from aquaflow.geometry.similarity import rotation_from_quaternion
-from aquaflow.mapping.neural.decoder import GroupAttention, apply_residuals
-from aquaflow.mapping.neural.observation import FURTHEST, encoded_observation, observation
-from aquaflow.mapping.neural.tokens import BUCKET, Tokens, visible_tokens
+from aquaflow.mapping.neural.decoder import (
+    BUCKET,
+    FURTHEST,
+    GroupAttention,
+    Tokens,
+    apply_residuals,
+    encoded_observation,
+    observation,
+    visible_tokens,
+)
 from aquaflow.mapping.neural.voxel_groups import EMPTY
-from aquaflow.render.encoding import sinusoidal_encoding
+from aquaflow.render.water import sinusoidal_encoding
 from tests.mapping.neural.decoder_scene import CENTRE, ROWS, Scene
 
 VARIANTS = ("lgpd", "mlp")

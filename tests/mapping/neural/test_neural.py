@@ -12,7 +12,7 @@ import torch
 from aquaflow.config import MappingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.neural.decode import DECODED
+from aquaflow.mapping.neural.decoder import DECODED
 from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.mapping.neural.voxel_groups import EMPTY, VoxelGroups
 from tests.mapping.mapping_scenes import (

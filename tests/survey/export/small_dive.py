@@ -15,10 +15,10 @@ from aquaflow.config import Config, MappingConfig
 from aquaflow.dive.map_file import write_map_file
 from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import raw_colour
+from aquaflow.mapping.gaussians import raw_colour
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
-from aquaflow.render.activation import radiance
+from aquaflow.render.contract import radiance
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of

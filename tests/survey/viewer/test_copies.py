@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.map_copy import MapCopy
+from aquaflow.mapping.state import MapCopy
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
 from aquaflow.survey.viewer.live_viewer import pack_for_browser
 

@@ -27,7 +27,7 @@ from aquaflow.lab.bench.render.rows import Row, row_of
 from aquaflow.lab.bench.render.timing import Sample, interleave
 from aquaflow.render.contract import CPU, Renderer
 from aquaflow.render.example_scene import NAMES, SMALL, Size, SplatScene, height_field
-from aquaflow.render.parity import differences
+from aquaflow.render.reference import differences
 
 JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
 """What a benchmark writes."""

@@ -11,13 +11,12 @@ from aquaflow.lab.bench.meter import Meter
 from aquaflow.lab.bench.render.opensplat import NOTE, OpenSplat
 from aquaflow.lab.bench.render.timing import Clock, Sample, time_renderer, torch_threads
 from aquaflow.render.contract import Renderer
-from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.cpu import CpuRenderer, TileRenderer
 from aquaflow.render.example_scene import SMALL, Size, SplatScene
 from aquaflow.render.gsplat import GsplatRenderer
 from aquaflow.render.library import NativeUnavailableError
 from aquaflow.render.native.build import supported_isas
 from aquaflow.render.reference import ReferenceRenderer
-from aquaflow.render.tiles import TileRenderer
 
 TILES_MOST = 30_000 * 640 * 480
 REFERENCE_MOST = SMALL.n * SMALL.pixels

@@ -16,7 +16,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.training.correspondences import correspondences
 from aquaflow.lab.training.pair_generator.render import BRIGHTEST, median_depth
 from aquaflow.lab.training.pairs import Pair, ViewBatch, joined_views
-from aquaflow.mapping.rendering import show
+from aquaflow.mapping.scene import show
 from aquaflow.mapping.state import NO_PIXELS
 from aquaflow.render import select_renderer
 from aquaflow.render.views import View, in_time

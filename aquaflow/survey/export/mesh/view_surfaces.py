@@ -21,11 +21,11 @@ from aquaflow.dive.point_cloud import PosedView
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.render.activation import activate
+from aquaflow.render.contract import activate
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View, in_time
 from aquaflow.survey.export.ortho.sightings import FAR, PICTURE_SIGMA_PX
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.sightings import SOLID
 
 Array = npt.NDArray[np.float64]
 Float = npt.NDArray[np.float32]

@@ -1,7 +1,7 @@
 """What colours an ortho shows: the scene without its water, or through a stated depth of it.
 
 Without water, a pixel is what restoration makes of it at the range from which the nearest view saw
-it (mapping/clear_colours.py): no channel is amplified beyond what its light there allows, and a
+it (mapping/restoration.py): no channel is amplified beyond what its light there allows, and a
 channel of which the pictures had too little follows the others.
 """
 
@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from aquaflow.dive.restored import exposure_of_looks
-from aquaflow.mapping.clear_colours import mean_water, restored_radiance
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import to_bytes
+from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
 from aquaflow.render.transfers import picture_out, water_in
 
 Array = npt.NDArray[np.float64]

@@ -20,7 +20,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View, in_time
 from aquaflow.survey.export.ortho.ground import Ground
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.sightings import SOLID
 
 Array = npt.NDArray[np.float64]
 

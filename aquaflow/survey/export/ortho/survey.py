@@ -22,7 +22,7 @@ from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.telemetry.world_frame import WorldFrame
-from aquaflow.water.posed_picture import SOLID
+from aquaflow.water.sightings import SOLID
 
 Kind = Literal["ortho", "dem"]
 Progress = Callable[[str, int, int], None]
