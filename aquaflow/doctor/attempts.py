@@ -125,12 +125,11 @@ def infer(device: Device) -> Figures:
     Raises:
         AquaFlowError: it does not run there, runs elsewhere, or says something else.
     """
+    from aquaflow.prior.describe import check, differences, example_picture
     from aquaflow.prior.describers import describer_in
-    from aquaflow.prior.example_picture import example_picture
     from aquaflow.prior.factory import SHIPPED
     from aquaflow.prior.folder import read_card
     from aquaflow.prior.runtime import RuntimeSettings
-    from aquaflow.prior.verification import check, differences
 
     settings, card = RuntimeSettings(device, "fp32"), read_card(SHIPPED)
     times = [time.perf_counter()]

@@ -11,16 +11,13 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.contract import Float, RangeUnit
-from aquaflow.prior.depth_describer import DepthDescriber
+from aquaflow.prior.depth_describer import DepthDescriber, as_input, multiple_of, resize
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.framing import as_input, multiple_of, resize
-from aquaflow.prior.learned_range import MOST_LOG, LearnedRange, cell_rays
 from aquaflow.prior.mast3r.describer import Mast3rDescriber
-from aquaflow.prior.network import Describer, Half, Picture, unit
+from aquaflow.prior.network import MOST_LOG, Describer, Half, LearnedRange, Picture, cell_rays, unit
 from aquaflow.prior.oracle import OracleDescriber
-from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
+from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings
 
 MULTIPLE_PX = 16
 """Sides of the pictures that the compact network takes."""

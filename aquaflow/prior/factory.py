@@ -21,7 +21,7 @@ from aquaflow.prior.folder import CARD
 from aquaflow.prior.runtime import RuntimeSettings
 
 if TYPE_CHECKING:
-    from aquaflow.prior.keypoint_networks.network import KeypointNetwork
+    from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointNetwork
 
 NetworkKind = Literal["xfeat", "aliked"]
 """Networks of others, by their kind of prior."""
@@ -72,7 +72,7 @@ def keypoint_network(kind: NetworkKind, device: str) -> KeypointNetwork:
         AquaFlowError: a package or the device is not there.
     """
     if kind == "xfeat":
-        from aquaflow.prior.keypoint_networks.xfeat import XFeat
+        from aquaflow.prior.keypoint_networks.aliked import XFeat
 
         return XFeat(device)
     from aquaflow.prior.keypoint_networks.aliked import AlikedLightGlue

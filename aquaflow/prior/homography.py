@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.contract import Keypoints, Mask
-from aquaflow.prior.fields import pixel_grid
-from aquaflow.prior.flow import Float, Grey
+from aquaflow.prior.flow import Float, Grey, pixel_grid
 
 SIFT_FEATURES = 2000
 """Strongest keypoints of a picture that are kept."""

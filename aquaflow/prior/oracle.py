@@ -18,8 +18,7 @@ from aquaflow.base.errors import InputError, reason_of
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.folder import PriorCard, read_card, sha256_of, write_card
-from aquaflow.prior.learned_range import LearnedRange
-from aquaflow.prior.network import Half, Picture
+from aquaflow.prior.network import Half, LearnedRange, Picture
 
 TRUTH = "truth.npz"
 """File of the folder: pictures by their checksum, and what each cell shows."""

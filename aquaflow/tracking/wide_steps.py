@@ -14,7 +14,7 @@ from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding, Prior
-from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.homography import flow_of_homography, homography
 from aquaflow.tracking.loops.keypoints import match_keypoints
 from aquaflow.tracking.pose.depth_fusion import fuse

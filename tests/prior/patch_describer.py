@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import RangeUnit
-from aquaflow.prior.learned_range import LearnedRange
 from aquaflow.prior.mast3r.describer import CELL_PX
-from aquaflow.prior.network import unit
+from aquaflow.prior.network import LearnedRange, unit
 
 SIDE_PX = 24
 """Of the square around a cell's centre that describes it."""

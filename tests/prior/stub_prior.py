@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, sha256_of, write_card
+from aquaflow.prior.runtime import INT8_ENCODER
 
 
 def write_stub(

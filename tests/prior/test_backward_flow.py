@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from aquaflow.prior.backward_flow import Float, backward_flow, reverse
-from aquaflow.prior.fields import pixel_grid, sample
+from aquaflow.prior.flow import Float, backward_flow, pixel_grid, reverse, sample
 from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,

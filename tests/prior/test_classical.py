@@ -10,8 +10,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior import homography
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.fields import pixel_grid, sample
-from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX
+from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, pixel_grid, sample
 from aquaflow.prior.flow_pair import FlowPair
 from tests.prior.textured_pictures import (
     HEIGHT,

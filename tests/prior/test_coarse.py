@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.prior import coarse
-from aquaflow.prior.coarse import coarse_flow, mutual_matches
+from aquaflow.prior import hybrid as coarse
+from aquaflow.prior.hybrid import coarse_flow, mutual_matches
 from aquaflow.prior.network import unit
 
 Float = npt.NDArray[np.float32]

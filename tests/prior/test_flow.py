@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.prior.fields import pixel_grid, sample
 from aquaflow.prior.flow import (
     BORDER_PX,
     FlowMatcher,
@@ -14,6 +13,8 @@ from aquaflow.prior.flow import (
     check_by_numpy,
     confidence,
     normalised_grey,
+    pixel_grid,
+    sample,
 )
 from aquaflow.prior.flow import texture as texture_of
 from tests.prior.textured_pictures import (

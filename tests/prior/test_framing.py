@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.prior.framing import GREY, ImagePadding
+from aquaflow.prior.depth_describer import GREY, ImagePadding
 
 CELL = 8
 

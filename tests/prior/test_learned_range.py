@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior.learned_range import LearnedRange
+from aquaflow.prior.network import LearnedRange
 
 CAMERA = CameraModel(40, 30, 40.0, 40.0, 20.0, 15.0)
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from aquaflow.prior.refinement import (
+from aquaflow.prior.flow import (
     MAX_STEP_PX,
     Float,
     Grey,

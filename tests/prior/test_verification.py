@@ -12,9 +12,8 @@ from typer.testing import CliRunner, Result
 from aquaflow import cli
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.prior import runtime
-from aquaflow.prior.describe import describe
+from aquaflow.prior.describe import describe, difference
 from aquaflow.prior.factory import SHIPPED
-from aquaflow.prior.verification import difference
 from tests.prior.pretended_gpu import Fault, PretendedGpu
 from tests.prior.tiny_depth import card, write_network
 

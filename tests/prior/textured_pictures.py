@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior.refinement import Float, Grey
+from aquaflow.prior.flow import Float, Grey
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.prior.depth_card import IMAGENET_MEAN, IMAGENET_STD, DepthCard
+from aquaflow.prior.folder import IMAGENET_MEAN, IMAGENET_STD, DepthCard
 
 LOWEST = 0.1
 """Red, of 1, from which the network with a logarithm knows something."""

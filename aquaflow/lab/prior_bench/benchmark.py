@@ -15,9 +15,9 @@ from aquaflow.config.stage import validate
 from aquaflow.lab.bench import machine
 from aquaflow.lab.evaluation.matching import LEVELS, Picture, homography_recall, matcher_of
 from aquaflow.lab.prior_bench.latency import BenchmarkedPrior, latency_rows, sea_floor
-from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.factory import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD, read_card
+from aquaflow.prior.runtime import INT8_ENCODER
 
 SIZES = ((320, 240), (640, 480))
 """Width and height: the one that the cost is bounded at, and one of four times the pixels."""

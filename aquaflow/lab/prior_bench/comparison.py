@@ -27,10 +27,15 @@ from aquaflow.lab.prior_bench.pair import FoundMatches, KnownPair, Picture
 from aquaflow.lab.prior_bench.pair_figures import PairFigures, figures_of
 from aquaflow.prior.contract import Keypoints, Prior
 from aquaflow.prior.factory import NetworkKind, keypoint_network, make_prior
-from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.hybrid import HybridEncoding
-from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointEncoding, KeypointPrior
-from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Size, warm_up
+from aquaflow.prior.keypoint_networks.keypoint_prior import (
+    KeypointEncoding,
+    KeypointNetwork,
+    KeypointPrior,
+    Size,
+    warm_up,
+)
 from aquaflow.types import Frame
 
 Progress = Callable[[str, int, int], None]

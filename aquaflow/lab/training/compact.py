@@ -24,7 +24,6 @@ from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE
 from aquaflow.lab.training.pairs import Pair, join
-from aquaflow.prior.compact.matching import descriptors_at, window_products
 from aquaflow.prior.compact.network import (
     COARSE,
     FINE,
@@ -32,6 +31,8 @@ from aquaflow.prior.compact.network import (
     CompactPrior,
     Encoded,
     cell_rays,
+    descriptors_at,
+    window_products,
 )
 
 

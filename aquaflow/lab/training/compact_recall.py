@@ -14,11 +14,18 @@ from aquaflow.lab.training.correspondences import Correspondences, correspondenc
 from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pairs import Pair
 from aquaflow.prior import flow as dense
-from aquaflow.prior.coarse import coarse_flow
 from aquaflow.prior.compact.export import INPUTS
-from aquaflow.prior.compact.matching import coarse_at, descriptors_at, fine_around
-from aquaflow.prior.compact.network import FINE, Compared, Encoded, cell_rays
-from aquaflow.prior.fields import sample
+from aquaflow.prior.compact.network import (
+    FINE,
+    Compared,
+    Encoded,
+    cell_rays,
+    coarse_at,
+    descriptors_at,
+    fine_around,
+)
+from aquaflow.prior.flow import sample
+from aquaflow.prior.hybrid import coarse_flow
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 SEED = 1000

@@ -38,8 +38,8 @@ from aquaflow.lab.training.schedule import Schedule
 from aquaflow.lab.training.trainer import Progress, TrainingPlan, has_ended, train
 from aquaflow.prior.compact.export import export
 from aquaflow.prior.compact.network import CompactPrior
-from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, write_card
+from aquaflow.prior.runtime import INT8_ENCODER
 
 POOL, PRIOR = "pool", "prior"
 """Folders of a run: training pairs, the exported prior."""

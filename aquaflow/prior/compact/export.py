@@ -21,10 +21,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.prior.compact.network import COARSE, STRIDE, CompactPrior, Compared, Encoded
-from aquaflow.prior.compact.quantise import INT8_ENCODER, quantise
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card
 from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
-from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
+from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings, quantise
 
 LICENCE = "Apache-2.0; trained on generated pictures only"
 LICENCE_WITH_PICTURES = "Apache-2.0; trained on generated pictures and those that training names"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -14,13 +14,11 @@ from scipy.spatial import cKDTree
 
 from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.prior import flow as dense
-from aquaflow.prior.candidates import from_homography, from_prediction
+from aquaflow.prior.classical import WARM_UP, FlowPrior
 from aquaflow.prior.contract import Encoding, Float, Keypoints, Mask
-from aquaflow.prior.fields import pixel_grid, sample
-from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
-from aquaflow.prior.flow_prior import FlowPrior
+from aquaflow.prior.flow import pixel_grid, sample
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair, from_homography, from_prediction
 from aquaflow.prior.homography import MIN_INLIERS, RANSAC_PX, flow_of_homography
-from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Picture, Size, warm_up
 
 FEATURE_PIXELS, FEATURE_DESCRIPTORS = "feature_pixels", "feature_descriptors"
 """Of a packed encoding; ``pixels`` and ``descriptors`` are SIFT's."""
@@ -200,3 +198,45 @@ def _spread(
     summed = np.asarray(cv2.GaussianBlur(summed, (0, 0), SMOOTH_CELLS))
     grid = pixel_grid(height, width) / np.float32(CELL_PX)
     return sample(summed / (total + np.float32(MOTION_WEIGHT))[..., None], grid)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# What a keypoint network does: find points in one picture, and the same points in another.
+
+Picture = npt.NDArray[np.uint8]
+Index = npt.NDArray[np.int64]
+Size = tuple[int, int]
+"""Height and width, px."""
+
+
+class KeypointNetwork(Protocol):
+    """A detector of keypoints and the matcher that it was trained with."""
+
+    name: str
+
+    def detect(
+        self,
+        picture: Picture,  # [H, W, 3] RGB
+    ) -> Keypoints:
+        """The strongest keypoints, in this package's pixels; none where nothing is shown."""
+        ...
+
+    def match(self, a: Keypoints, b: Keypoints, size_a: Size, size_b: Size) -> tuple[Index, Index]:
+        """Indices [M] into a and into b of keypoints that show the same thing."""
+        ...
+
+
+NO_MATCHES = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+"""Of pictures without keypoints."""
+
+
+def no_keypoints(dimension: int) -> Keypoints:
+    """Those of a picture that shows nothing; descriptors have ``dimension`` entries."""
+    return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, dimension), np.float32))
+
+
+def warm_up(network: KeypointNetwork) -> None:
+    """Run all of the network once, on a picture that shows nothing."""
+    size = WARM_UP[:2]
+    keypoints = network.detect(np.zeros(WARM_UP, np.uint8))
+    network.match(keypoints, keypoints, size, size)

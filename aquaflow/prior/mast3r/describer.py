@@ -16,10 +16,9 @@ import numpy as np
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.prior.depth_describer import ImagePadding, as_input
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.framing import ImagePadding, as_input
-from aquaflow.prior.learned_range import LearnedRange
-from aquaflow.prior.network import METRIC_SIGMA, SHORTEST, Half, Picture
+from aquaflow.prior.network import METRIC_SIGMA, SHORTEST, Half, LearnedRange, Picture
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 CELL_PX = 8

@@ -5,16 +5,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aquaflow.prior.mast3r.blocks import NORM_EPS, DecoderBlock, EncoderBlock, Mlp
-from aquaflow.prior.mast3r.dense_head import DenseHead
-from aquaflow.prior.mast3r.rotary import RotaryTable, rotary_table
-from aquaflow.prior.mast3r.settings import FULL, PATCH_PX, Mast3rSize
+# --- ----------------------------------------------------------------------------------------------
+# Sizes of the network: the public checkpoint's, and a tiny one of the same code for tests.
+
+PATCH_PX = 16
+"""Side of the square that one token stands for; sides of a picture are multiples of it."""
+
+
+@dataclass(frozen=True)
+class Mast3rSize:
+    """Depths and widths; the defaults are those of ViT-L / ViT-B, catmlp + dpt, pts3d + desc24."""
+
+    encoder_depth: int = 24
+    encoder_width: int = 1024
+    encoder_heads: int = 16
+    decoder_depth: int = 12
+    decoder_width: int = 768
+    decoder_heads: int = 12
+    mlp_ratio: int = 4
+    rotary_base: float = 100.0
+    level_widths: tuple[int, int, int, int] = (96, 192, 384, 768)
+    """Of the dense head's pyramid, from fine to coarse."""
+    fused_width: int = 256
+    """Of the dense head's fusion."""
+    head_width: int = 128
+    """Of the dense head's last hidden layer."""
+    descriptor: int = 24
+
+    @property
+    def hooks(self) -> tuple[int, int, int, int]:
+        """Layers the dense head reads: the encoding, and after 1/2, 3/4 and all of decoding."""
+        depth = self.decoder_depth
+        return 0, depth // 2, depth * 3 // 4, depth
+
+
+FULL = Mast3rSize()
+"""The public checkpoint: 1,017 tensors, 695 million numbers."""
+
+TINY = Mast3rSize(
+    encoder_depth=2,
+    encoder_width=48,
+    encoder_heads=3,
+    decoder_depth=4,
+    decoder_width=32,
+    decoder_heads=2,
+    level_widths=(8, 12, 16, 24),
+    fused_width=16,
+    head_width=8,
+    descriptor=6,
+)
+"""For tests: the same code in a second."""
+
 
 MEAN = STD = 0.5
 """Of the pixel values that the checkpoint was trained on."""
@@ -159,3 +208,306 @@ class Mast3r(nn.Module):
         table = rotary_table(rows, columns, head_width, self.size.rotary_base)
         device = self.mask_token.device
         return RotaryTable(table.cosine.to(device), table.sine.to(device))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Transformer blocks of encoder and decoders: pre-norm, rotary attention, GELU.
+#
+# Attribute names are those of the public checkpoint's tensors.
+
+NORM_EPS = 1e-6
+"""Of layer normalisation, as in the vision transformers that the checkpoint descends from."""
+
+
+class Attention(nn.Module):
+    """Self-attention with one projection for queries, keys and values."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, N, D]
+        table: RotaryTable,
+    ) -> Tensor:
+        """[B, N, D]"""
+        q, k, v = (_split(part, self.heads) for part in self.qkv(x).chunk(3, dim=-1))
+        mixed = F.scaled_dot_product_attention(table.turn(q), table.turn(k), v)
+        return self.proj(_merge(mixed))  # type: ignore[no-any-return]
+
+
+class CrossAttention(nn.Module):
+    """Queries of one view, keys and values of the other."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.projq = nn.Linear(width, width)
+        self.projk = nn.Linear(width, width)
+        self.projv = nn.Linear(width, width)
+        self.proj = nn.Linear(width, width)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, N, D]
+        other: Tensor,  # [B, M, D]
+        table: RotaryTable,
+        other_table: RotaryTable,
+    ) -> Tensor:
+        """[B, N, D]"""
+        q = table.turn(_split(self.projq(x), self.heads))
+        k = other_table.turn(_split(self.projk(other), self.heads))
+        v = _split(self.projv(other), self.heads)
+        return self.proj(_merge(F.scaled_dot_product_attention(q, k, v)))  # type: ignore[no-any-return]
+
+
+class Mlp(nn.Module):
+    """Two layers with a GELU between."""
+
+    def __init__(self, width: int, hidden: int, out: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.fc2 = nn.Linear(hidden, out)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, N, D]
+    ) -> Tensor:
+        """[B, N, out]"""
+        return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
+
+
+class EncoderBlock(nn.Module):
+    """Tokens of one picture look at each other."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.attn = Attention(width, heads)
+        self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.mlp = Mlp(width, mlp_ratio * width, width)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, N, D]
+        table: RotaryTable,
+    ) -> Tensor:
+        """[B, N, D]"""
+        x = x + self.attn(self.norm1(x), table)
+        return x + self.mlp(self.norm2(x))  # type: ignore[no-any-return]
+
+
+class DecoderBlock(nn.Module):
+    """Tokens of one view look at each other, then at the other view's."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.attn = Attention(width, heads)
+        self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.norm_y = nn.LayerNorm(width, eps=NORM_EPS)
+        self.cross_attn = CrossAttention(width, heads)
+        self.norm3 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.mlp = Mlp(width, mlp_ratio * width, width)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, N, D]
+        other: Tensor,  # [B, M, D]
+        table: RotaryTable,
+        other_table: RotaryTable,
+    ) -> Tensor:
+        """[B, N, D]"""
+        x = x + self.attn(self.norm1(x), table)
+        x = x + self.cross_attn(self.norm2(x), self.norm_y(other), table, other_table)
+        return x + self.mlp(self.norm3(x))  # type: ignore[no-any-return]
+
+
+def _split(
+    x: Tensor,  # [B, N, D]
+    heads: int,
+) -> Tensor:
+    """[B, heads, N, D / heads]"""
+    return x.reshape(*x.shape[:-1], heads, -1).transpose(1, 2)
+
+
+def _merge(
+    x: Tensor,  # [B, heads, N, d]
+) -> Tensor:
+    """[B, N, heads d]"""
+    return x.transpose(1, 2).flatten(2)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Rotary position embedding in two dimensions (RoPE; Su et al. 2021, here by row and column).
+#
+# The first half of a head's channels turns with the token's row, the second with its column. The
+# angles are a table of the picture's size, so that an exported graph holds them as a constant.
+
+
+@dataclass(frozen=True)
+class RotaryTable:
+    """Cosines and sines of all tokens of a picture."""
+
+    cosine: Tensor
+    """[N, d]"""
+    sine: Tensor
+    """[N, d]"""
+
+    def turn(
+        self,
+        x: Tensor,  # [B, heads, N, d]
+    ) -> Tensor:
+        """[B, heads, N, d] queries or keys, turned by where their tokens are."""
+        return x * self.cosine + _quarter_turned(x) * self.sine
+
+
+def rotary_table(rows: int, columns: int, head_width: int, base: float) -> RotaryTable:
+    """The table of a grid of tokens, row by row; ``head_width`` is a multiple of four."""
+    channels = head_width // 2
+    frequency = base ** (-torch.arange(0, channels, 2, dtype=torch.float32) / channels)
+    row = torch.arange(rows, dtype=torch.float32).repeat_interleave(columns)
+    column = torch.arange(columns, dtype=torch.float32).repeat(rows)
+    angles = [torch.outer(place, frequency).repeat(1, 2) for place in (row, column)]
+    angle = torch.cat(angles, dim=1)
+    return RotaryTable(angle.cos(), angle.sin())
+
+
+def _quarter_turned(
+    x: Tensor,  # [..., d]
+) -> Tensor:
+    """[..., d] each pair (a, b) of a half's lower and upper channels becomes (-b, a)."""
+    a, b, c, d = x.chunk(4, dim=-1)
+    return torch.cat([-b, a, -d, c], dim=-1)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# From tokens to pixels: the dense prediction head (DPT; Ranftl et al. 2021).
+#
+# Four layers of tokens become a pyramid, which is fused from coarse to fine. Attribute names are
+# those of the public checkpoint's tensors; its ``layer_rn`` repeats ``layer1_rn`` ...
+# ``layer4_rn``.
+
+POINT_AND_CONFIDENCE = 4
+"""Channels: x, y, z and a confidence."""
+
+
+class ResidualConvUnit(nn.Module):
+    """Two convolutions that add to what they are given."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, C, h, w]
+    ) -> Tensor:
+        """[B, C, h, w]"""
+        return x + self.conv2(F.relu(self.conv1(F.relu(x))))  # type: ignore[no-any-return]
+
+
+class FeatureFusion(nn.Module):
+    """Adds a finer level of the pyramid to what came from below, and doubles the size."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.out_conv = nn.Conv2d(width, width, 1)
+        self.resConfUnit1 = ResidualConvUnit(width)
+        self.resConfUnit2 = ResidualConvUnit(width)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, C, h, w]
+        level: Tensor | None = None,  # [B, C, h, w]; None at the coarsest
+    ) -> Tensor:
+        """[B, C, 2h, 2w]"""
+        if level is not None:
+            x = x + self.resConfUnit1(level)
+        return self.out_conv(double(self.resConfUnit2(x)))  # type: ignore[no-any-return]
+
+
+class Doubled(nn.Module):
+    """``double`` as a layer of a sequence."""
+
+    def forward(
+        self,
+        x: Tensor,  # [B, C, h, w]
+    ) -> Tensor:
+        """[B, C, 2h, 2w]"""
+        return double(x)
+
+
+class Scratch(nn.Module):
+    """The layers that fuse the pyramid."""
+
+    def __init__(self, size: Mast3rSize) -> None:
+        super().__init__()
+        fused = size.fused_width
+        levels = [nn.Conv2d(n, fused, 3, padding=1, bias=False) for n in size.level_widths]
+        self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = levels
+        self.layer_rn = nn.ModuleList(levels)
+        self.refinenet1 = FeatureFusion(fused)
+        self.refinenet2 = FeatureFusion(fused)
+        self.refinenet3 = FeatureFusion(fused)
+        self.refinenet4 = FeatureFusion(fused)
+
+    def forward(
+        self,
+        pyramid: Sequence[Tensor],  # four of [B, C, h, w], from fine to coarse
+    ) -> Tensor:
+        """[B, C, 2h, 2w] twice the finest level's size."""
+        first, second, third, fourth = (
+            conv(level) for conv, level in zip(self.layer_rn, pyramid, strict=True)
+        )
+        height, width = third.shape[-2:]  # an odd number of tokens was rounded up when halved
+        fused = self.refinenet4(fourth)[..., :height, :width]
+        fused = self.refinenet2(self.refinenet3(fused, third), second)
+        return self.refinenet1(fused, first)  # type: ignore[no-any-return]
+
+
+class DenseHead(nn.Module):
+    """Tokens of four layers -> raw point and confidence of every pixel."""
+
+    def __init__(self, size: Mast3rSize) -> None:
+        super().__init__()
+        n1, n2, n3, n4 = size.level_widths
+        wide, narrow = size.encoder_width, size.decoder_width
+        self.act_postprocess = nn.ModuleList(
+            [
+                nn.Sequential(nn.Conv2d(wide, n1, 1), nn.ConvTranspose2d(n1, n1, 4, stride=4)),
+                nn.Sequential(nn.Conv2d(narrow, n2, 1), nn.ConvTranspose2d(n2, n2, 2, stride=2)),
+                nn.Sequential(nn.Conv2d(narrow, n3, 1)),
+                nn.Sequential(nn.Conv2d(narrow, n4, 1), nn.Conv2d(n4, n4, 3, stride=2, padding=1)),
+            ]
+        )
+        self.scratch = Scratch(size)
+        self.head = nn.Sequential(
+            nn.Conv2d(size.fused_width, size.fused_width // 2, 3, padding=1),
+            Doubled(),
+            nn.Conv2d(size.fused_width // 2, size.head_width, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(size.head_width, POINT_AND_CONFIDENCE, 1),
+        )
+
+    def forward(
+        self,
+        layers: Sequence[Tensor],  # four of [B, N, D]
+        rows: int,
+        columns: int,
+    ) -> Tensor:
+        """[B, 4, 16 rows, 16 columns]"""
+        grids = [x.transpose(1, 2).reshape(len(x), -1, rows, columns) for x in layers]
+        levels = zip(self.act_postprocess, grids, strict=True)
+        return self.head(self.scratch([stage(grid) for stage, grid in levels]))  # type: ignore[no-any-return]
+
+
+def double(
+    x: Tensor,  # [B, C, h, w]
+) -> Tensor:
+    """[B, C, 2h, 2w] bilinear, corner to corner."""
+    return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=True)

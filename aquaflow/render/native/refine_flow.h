@@ -1,5 +1,5 @@
 // One symmetric Gauss-Newton step of a dense flow; what it does and why is in
-// aquaflow/prior/refinement.py, whose constants come in.
+// aquaflow/prior/flow.py, whose constants come in.
 #pragma once
 
 #include <algorithm>

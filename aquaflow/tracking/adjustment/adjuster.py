@@ -18,10 +18,9 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.tracking import AdjustmentConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.prior.candidates import best_flow, from_prediction
 from aquaflow.prior.contract import Encoding
 from aquaflow.prior.flow import FlowMatcher
-from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair, best_flow, from_prediction
 from aquaflow.tracking.adjustment.anchored_points import (
     AnchoredPoints,
     sampled_points,

@@ -11,7 +11,7 @@ from aquaflow.keyframes import Pointmap
 
 WIDE_WIDTHS = 0.04
 """Widths of the picture: flow follows smaller steps from the last matches as well, and DIS alone
-loses those beyond 0.15 (``prior/candidates.py``)."""
+loses those beyond 0.15 (``prior/flow_pair.py``)."""
 GRID = 12
 """Pixels a side that are looked at to tell whether a step is wide."""
 

@@ -24,7 +24,7 @@ OUTER_CELLS = 7
 """Side of the square around a cell that its mean is taken over."""
 INNER_CELLS = 3
 """Side of the square around a cell that is left out: matches 4 px away or nearer share their
-windows (prior/refinement.py), and their errors."""
+windows (prior/flow.py), and their errors."""
 LEAST_CELLS = 2.5
 """Known part of the square, in cells, below which nothing is known around: 40 pixels."""
 

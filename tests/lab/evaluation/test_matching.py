@@ -18,7 +18,7 @@ from aquaflow.lab.evaluation.matching import (
     relit,
 )
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import pixel_grid
 
 Picture = npt.NDArray[np.uint8]
 STILL = Distortion.scale("still", 0.0)

@@ -25,7 +25,7 @@ from aquaflow.lab.prior_bench.pair import FoundMatches, KnownPair
 from aquaflow.lab.prior_bench.pair_figures import figures_of
 from aquaflow.lab.training.pair_generator.cameras import WIDE
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointPrior
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame

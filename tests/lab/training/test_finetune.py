@@ -25,9 +25,8 @@ from aquaflow.lab.training.finetune import (
     read_data,
 )
 from aquaflow.lab.training.mining import MinedPairs
-from aquaflow.prior.mast3r import weights
-from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.settings import TINY
+from aquaflow.prior.mast3r import export as weights
+from aquaflow.prior.mast3r.network import TINY, Mast3r
 from tests.lab.training.data_trees import write_colmap, write_tartanair
 from tests.small_recording import GIVE_UP_S
 
@@ -154,7 +153,7 @@ import sys
 from pathlib import Path
 import torch
 from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.settings import TINY
+from aquaflow.prior.mast3r.network import TINY
 from aquaflow.lab.training import finetune
 from aquaflow.lab.training.distributed import joined_processes
 from aquaflow.lab.training.schedule import Schedule

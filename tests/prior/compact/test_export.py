@@ -25,9 +25,8 @@ from aquaflow.prior.compact.export import (
     parity_of,
 )
 from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
-from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
+from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")

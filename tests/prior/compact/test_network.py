@@ -8,13 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.prior.compact.matching import coarse_at, fine_around
 from aquaflow.prior.compact.network import (
     COARSE,
     FINE,
     CompactPrior,
     NetworkSize,
     cell_rays,
+    coarse_at,
+    fine_around,
     locally_normalised,
 )
 

@@ -11,9 +11,8 @@ import torch
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import PriorConfig
 from aquaflow.prior.factory import make_prior
-from aquaflow.prior.keypoint_networks import packages
-from aquaflow.prior.keypoint_networks.device import torch_device
-from aquaflow.prior.keypoint_networks.packages import load, weights_file
+from aquaflow.prior.keypoint_networks import aliked as packages
+from aquaflow.prior.keypoint_networks.aliked import load, torch_device, weights_file
 
 
 def write_package(folder: Path, name: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 from aquaflow.config import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.factory import keypoint_network, make_prior
-from aquaflow.prior.keypoint_networks.network import KeypointNetwork
+from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointNetwork
 from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,

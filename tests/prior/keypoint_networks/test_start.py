@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.keypoint_networks.keypoint_prior import flow_from_matches
 
 WIDTH, HEIGHT = 240, 180

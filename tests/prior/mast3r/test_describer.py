@@ -12,12 +12,11 @@ from aquaflow.config.prior import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.factory import make_prior
-from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.hybrid import HybridPair, HybridPrior
 from aquaflow.prior.mast3r.describer import CELL_PX, Mast3rDescriber
 from aquaflow.prior.mast3r.export import export
-from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.settings import TINY
+from aquaflow.prior.mast3r.network import TINY, Mast3r
 from aquaflow.prior.runtime import RuntimeSettings
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 

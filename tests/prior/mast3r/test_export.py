@@ -23,8 +23,7 @@ from aquaflow.prior.factory import make_prior
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, read_card
 from aquaflow.prior.hybrid import HybridEncoding
 from aquaflow.prior.mast3r.export import OUTPUTS, export, parity_of, relative_difference
-from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.settings import TINY
+from aquaflow.prior.mast3r.network import TINY, Mast3r
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 pytestmark = pytest.mark.ci

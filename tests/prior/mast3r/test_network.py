@@ -11,10 +11,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.prior.mast3r.blocks import Attention, CrossAttention
-from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
-from aquaflow.prior.mast3r.rotary import rotary_table
-from aquaflow.prior.mast3r.settings import FULL, PATCH_PX, TINY
+from aquaflow.prior.mast3r.network import (
+    FULL,
+    PATCH_PX,
+    TINY,
+    Attention,
+    CrossAttention,
+    Mast3r,
+    ViewGeometry,
+    rotary_table,
+)
 
 KEYS = Path(__file__).parents[4] / "shared" / "design" / "mast3r_keys.txt"
 LAYOUT_SHA256 = "1e4692eac072c410a86211e06a9a3007d91134cf353bbabe874b0006754f9cc4"

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from aquaflow.base.errors import InputError
-from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.settings import TINY
-from aquaflow.prior.mast3r.weights import load_checkpoint
+from aquaflow.prior.mast3r.export import load_checkpoint
+from aquaflow.prior.mast3r.network import TINY, Mast3r
 
 
 @pytest.fixture
