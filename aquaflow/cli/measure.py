@@ -224,7 +224,7 @@ def scale(
         if not (math.isfinite(value) and value > 0.0):
             raise typer.BadParameter(f"--{name} must be a positive number of metres")
     from aquaflow.survey.measure.marked_length import keep_length
-    from aquaflow.telemetry.known_lengths.known_lengths_file import FILE, read_known_lengths
+    from aquaflow.telemetry.known_lengths.known_length import FILE, read_known_lengths
 
     read_known_lengths(dive)  # a damaged file is found before the map is drawn
     known = _measure(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)

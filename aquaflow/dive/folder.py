@@ -41,7 +41,7 @@ from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
-from aquaflow.telemetry.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
+from aquaflow.telemetry.known_lengths.known_length import FILE as KNOWN_LENGTHS
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 

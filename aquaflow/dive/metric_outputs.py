@@ -15,7 +15,7 @@ from aquaflow.dive.placement import to_geodetic
 from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
-from aquaflow.telemetry.interpolation import Interpolation
+from aquaflow.telemetry.camera_path import Interpolation
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.utc import UtcClock, fit_utc
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.noise import WHITE, Noise
-from aquaflow.telemetry.problem import TelemetryProblem
-from aquaflow.telemetry.solve import Solution, solve
+from aquaflow.telemetry.factors import Factor
+from aquaflow.telemetry.solve import Solution, TelemetryProblem, solve
+from aquaflow.telemetry.start import WHITE, Noise
 from aquaflow.telemetry.state import SCALE
 
 DIRECTIONS = ("attitude", "acceleration", "heading")

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S
-from aquaflow.telemetry.problem import TelemetryProblem
+from aquaflow.telemetry.solve import TelemetryProblem
 from aquaflow.telemetry.telemetry import Series, Telemetry, device_of
 from aquaflow.telemetry.time_offset import (
     NotSynchronisedError,
@@ -24,7 +23,7 @@ from aquaflow.telemetry.time_offset import (
     UnlikeError,
     estimate_time_offset,
 )
-from aquaflow.telemetry.turns import Turns, best_turns
+from aquaflow.telemetry.turns import SHORTEST_OVERLAP_S, Turns, best_turns
 from aquaflow.telemetry.world_frame import SourceReport, WorldFrame
 from aquaflow.types import AngularRate, Attitude
 

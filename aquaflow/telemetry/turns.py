@@ -13,9 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
+from aquaflow.geometry.similarity import nearest_rotation
 from aquaflow.telemetry.telemetry import Series
 from aquaflow.types import AngularRate, Attitude, TelemetrySample, values_of
 
@@ -163,3 +165,148 @@ def _in_order(source: str, samples: Sequence[AngularRate | Attitude]) -> Series:
     order = np.argsort(times, kind="stable")
     values = np.asarray([values_of(sample) for sample in samples], dtype=float)
     return Series(source, times[order], values[order])
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Every offset between two series of turns at once: how much of one the other explains.
+#
+# For each offset the rotation between the two sets of axes is the best one for that offset (Wahba's
+# problem by singular values), and constant rates, such as the bias of a gyro, are taken out of
+# both. All sums over the overlap are correlations, so the FFT gives them for all offsets together.
+
+CELL_S = 0.05
+"""Step of the search: a third of the smoothing, so that no peak falls between two steps."""
+COVERED = 0.8
+"""Share of a cell, and of the smoothing about it, that must have been measured."""
+SHORTEST_OVERLAP_S = 5.0
+"""Less than one cycle of an ROV's sway (4 to 9 s) matches almost anywhere in a log."""
+LEAST_OVERLAP = 0.2
+"""Of the shorter of the two: a single turn at the end of a dive looks like one at its beginning."""
+PEAK_PROMINENCE = 0.01
+"""Of the highest peak: what stands out less is noise on the way up to a peak."""
+RIVAL_SHARE = 0.5
+"""Of what the best offset explains: an offset that explains less is no rival. Mostly it is one at
+which half of the log, or more, would have been recorded without the video."""
+MOST_PEAKS = 8
+"""Highest first; the later ones only repeat what the first rivals show."""
+
+
+@dataclass(frozen=True)
+class RateSeries:
+    """Smoothed rates on a uniform grid of times."""
+
+    start_s: float
+    """Beginning of the first cell."""
+    cell_s: float
+    rate_rad_s: Array
+    """[L, 3]; zero where nothing was measured."""
+    measured: Array
+    """[L] 1 or 0."""
+
+    @staticmethod
+    def of(turns: Turns, sigma_s: float, cell_s: float = CELL_S) -> RateSeries:
+        """Mean rates over the cells, smoothed by a Gaussian."""
+        count = int(np.ceil((turns.end_s[-1] - turns.start_s[0]) / cell_s))
+        start_s = turns.start_s[0] + cell_s * np.arange(count)
+        angle, covered = turns.within(start_s, start_s + cell_s)
+        known = (covered >= COVERED).astype(float)
+        rate = angle / (cell_s * np.maximum(covered, COVERED))[:, None] * known[:, None]
+        width = sigma_s / cell_s
+        smooth = gaussian_filter1d(rate, width, axis=0, mode="constant")
+        weight = gaussian_filter1d(known, width, mode="constant")
+        measured = (weight >= COVERED).astype(float)
+        rate = smooth / np.maximum(weight, COVERED)[:, None] * measured[:, None]
+        return RateSeries(float(start_s[0]), cell_s, rate, measured)
+
+    def turns(self) -> Turns:
+        """The smoothed rates as turns over the cells."""
+        cells = np.flatnonzero(self.measured)
+        edges_s: Array = self.start_s + self.cell_s * np.arange(len(self.measured) + 1.0)
+        angle = self.cell_s * self.rate_rad_s[cells]
+        return Turns(edges_s[cells], edges_s[cells + 1], angle)
+
+
+@dataclass(frozen=True)
+class OffsetPeak:
+    """An offset at which the telemetry explains the camera's turns better than just beside it."""
+
+    offset_s: float
+    """Telemetry time + offset = video time."""
+    R_cb: Array
+    """[3, 3] body to camera."""
+    explained: float
+    """Share of the camera's turning, all of it, that the telemetry predicts; at most 1."""
+
+
+def peaks(camera: RateSeries, body: RateSeries, R_cb: Array | None) -> list[OffsetPeak]:  # [3, 3]
+    """The best offset and its rivals, best first; empty where none explains anything."""
+    from scipy.signal import find_peaks  # half a second, for the dives that have logs
+
+    explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
+    if not len(explained) or not np.isfinite(explained).any() or explained.max() <= 0.0:
+        return []
+    floor = np.concatenate([[0.0], np.maximum(explained, 0.0), [0.0]])
+    found, _ = find_peaks(floor, prominence=PEAK_PROMINENCE * explained.max())
+    found = found[floor[found] >= RIVAL_SHARE * explained.max()]
+    found = found[np.argsort(-floor[found], kind="stable")][:MOST_PEAKS] - 1
+    rotation = (
+        nearest_rotation(H[found]) if R_cb is None else np.broadcast_to(R_cb, (len(found), 3, 3))
+    )
+    return [
+        OffsetPeak(float(offsets_s[i]), rotation[n], float(explained[i]))
+        for n, i in enumerate(found)
+    ]
+
+
+def peak_at(
+    camera: RateSeries,
+    body: RateSeries,
+    R_cb: Array | None,  # [3, 3]
+    offset_s: float,
+) -> OffsetPeak:
+    """One offset, however much it explains."""
+    explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
+    near = int(np.argmin(np.abs(offsets_s - offset_s)))
+    R = nearest_rotation(H[near]) if R_cb is None else R_cb
+    return OffsetPeak(offset_s, R, float(explained[near]))
+
+
+def explained_at_all_offsets(
+    camera: RateSeries,
+    body: RateSeries,
+    R_cb: Array | None,  # [3, 3]
+) -> tuple[Array, Array, Array]:
+    """Share explained [L] (-inf where the overlap is short), H [L, 3, 3], offsets [L] in s."""
+    from scipy.signal import correlate
+
+    v, g, mv, mg = camera.rate_rad_s, body.rate_rad_s, camera.measured, body.measured
+
+    def sums(a: Array, b: Array) -> Array:  # [Nv] and [Ng]
+        return np.asarray(correlate(a, b, mode="full", method="fft"))
+
+    overlap = np.round(sums(mv, mg))
+    n = np.maximum(overlap, 1.0)
+    of_v = np.stack([sums(v[:, i], mg) for i in range(3)], axis=-1)
+    of_g = np.stack([sums(mv, g[:, i]) for i in range(3)], axis=-1)
+    H = np.stack([[sums(v[:, i], g[:, j]) for j in range(3)] for i in range(3)])
+    H = np.moveaxis(H, 2, 0) - of_v[:, :, None] * of_g[:, None, :] / n[:, None, None]
+    energy = sums(mv, (g**2).sum(axis=1)) - (of_g**2).sum(axis=1) / n
+    centred = v - (v.sum(axis=0) / max(mv.sum(), 1.0)) * mv[:, None]
+    total = float((centred**2).sum())
+    least = max(SHORTEST_OVERLAP_S / CELL_S, LEAST_OVERLAP * min(mv.sum(), mg.sum()))
+    feasible = (overlap >= least) & (total > 0.0)
+    explained = np.full(len(overlap), -np.inf)
+    if R_cb is None:
+        match = _largest_trace(H[feasible])
+    else:
+        match = np.einsum("ij,nij->n", R_cb, H[feasible])
+    explained[feasible] = (2.0 * match - energy[feasible]) / max(total, 1e-300)
+    shift = np.arange(len(overlap)) - (len(g) - 1)
+    offsets_s: Array = camera.start_s - body.start_s + CELL_S * shift.astype(float)
+    return explained, np.asarray(H), offsets_s
+
+
+def _largest_trace(H: Array) -> Array:  # [N, 3, 3]
+    """[N] largest trace of R^T H over all rotations R."""
+    singular = np.linalg.svd(H, compute_uv=False)
+    return np.asarray(singular[:, 0] + singular[:, 1] + np.sign(np.linalg.det(H)) * singular[:, 2])

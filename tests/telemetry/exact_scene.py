@@ -10,14 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import quaternion_from_rotation
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.factors.altitude import AltitudeFactor
-from aquaflow.telemetry.factors.attitude import ForceFactor, HeadingFactor, TiltFactor
-from aquaflow.telemetry.factors.constant_depth import ConstantDepthFactor
-from aquaflow.telemetry.factors.depth import DepthFactor
-from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.factors.length import LengthFactor
-from aquaflow.telemetry.factors.position import PlaceFactor, PositionFactor
-from aquaflow.telemetry.factors.velocity import VelocityFactor
+from aquaflow.telemetry.factors import (
+    AltitudeFactor,
+    ConstantDepthFactor,
+    DepthFactor,
+    Factor,
+    ForceFactor,
+    HeadingFactor,
+    LengthFactor,
+    PlaceFactor,
+    PositionFactor,
+    TiltFactor,
+    VelocityFactor,
+)
 from aquaflow.telemetry.state import MetricState
 from aquaflow.telemetry.telemetry import Series
 

@@ -15,7 +15,7 @@ from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
-from aquaflow.telemetry.problem import Carried
+from aquaflow.telemetry.solve import Carried
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import Velocity

@@ -10,10 +10,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.factors.attitude import ForceFactor, HeadingFactor, TiltFactor
-from aquaflow.telemetry.factors.factor import Factor, axes_along
-from aquaflow.telemetry.factors.position import PositionFactor
-from aquaflow.telemetry.factors.velocity import VelocityFactor
+from aquaflow.telemetry.factors import (
+    Factor,
+    ForceFactor,
+    HeadingFactor,
+    PositionFactor,
+    TiltFactor,
+    VelocityFactor,
+    axes_along,
+)
 from aquaflow.telemetry.state import LAG, SCALE, MetricState, P
 from aquaflow.telemetry.telemetry import Series
 from tests.telemetry.exact_scene import ExactScene, disturbed

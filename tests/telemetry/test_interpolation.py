@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.telemetry.interpolation import LONGEST_GAP_S, Interpolation
+from aquaflow.telemetry.camera_path import LONGEST_INTERPOLATED_S, Interpolation
 from aquaflow.telemetry.telemetry import Series
 
 S = 1_000_000_000
@@ -24,7 +24,7 @@ def test_between_two_samples_the_value_is_linear() -> None:
 
 
 def test_nothing_is_said_outside_of_the_samples_and_in_gaps() -> None:
-    depth = Interpolation.of([measured((0, 1.0), (LONGEST_GAP_S + 0.1, 2.0))])
+    depth = Interpolation.of([measured((0, 1.0), (LONGEST_INTERPOLATED_S + 0.1, 2.0))])
     assert [depth.at(t) for t in (-1, S, 3 * S)] == [None, None, None]
     assert depth.at(0) == 1.0
     assert Interpolation.of([]).at(0) is None

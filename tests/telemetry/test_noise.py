@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import cholesky
 
-from aquaflow.telemetry.noise import Noise, Process, SlowPart, likeliest
+from aquaflow.telemetry.start import Noise, Process, SlowPart, likeliest
 
 Array = npt.NDArray[np.float64]
 

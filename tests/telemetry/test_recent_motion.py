@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import so3_log
-from aquaflow.telemetry.recent_motion import HELD_S, KEPT_S, RecentMotion
+from aquaflow.telemetry.dead_reckoning import HELD_S, KEPT_S, RecentMotion
 from aquaflow.types import AngularRate, Depth, Velocity
 
 

@@ -7,10 +7,9 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.factors.length import LengthFactor
-from aquaflow.telemetry.noise import Process, SlowPart
+from aquaflow.telemetry.factors import Factor, LengthFactor
 from aquaflow.telemetry.solve import Solution, solve
+from aquaflow.telemetry.start import Process, SlowPart
 from aquaflow.telemetry.state import HEADING, SCALE, SHIFT, TURN, MetricState, P
 from tests.telemetry.exact_scene import ExactScene, disturbed
 

@@ -12,9 +12,11 @@ from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.reef_files import CSV, JSON, write_reef_numbers
 from aquaflow.survey.measure.rescaling import rescale, why_not
-from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale, scale_of
-from aquaflow.telemetry.known_lengths.known_lengths_file import (
+from aquaflow.telemetry.known_lengths.known_length import (
+    KnownLength,
+    LengthScale,
     read_known_lengths,
+    scale_of,
     with_length,
     write_known_lengths,
 )

@@ -10,11 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.telemetry import FusionConfig
-from aquaflow.telemetry.known_lengths.board_size import BoardView, board_lengths
-from aquaflow.telemetry.known_lengths.boards import BoardDetector, BoardSighting
+from aquaflow.telemetry.known_lengths.board_size import (
+    BoardDetector,
+    BoardSighting,
+    BoardView,
+    board_lengths,
+)
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.known_lengths.laser_dots import DotCandidates, find_dots
-from aquaflow.telemetry.known_lengths.laser_spacing import DOTS, laser_lengths
+from aquaflow.telemetry.known_lengths.laser_spacing import (
+    DOTS,
+    DotCandidates,
+    find_dots,
+    laser_lengths,
+)
 
 Array = npt.NDArray[np.float64]
 

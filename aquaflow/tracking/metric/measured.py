@@ -10,12 +10,15 @@ import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.telemetry.estimator import Estimate
-from aquaflow.telemetry.factors.altitude import AltitudeFactor
-from aquaflow.telemetry.factors.attitude import HeadingFactor, TiltFactor
-from aquaflow.telemetry.factors.depth import DepthFactor
-from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.factors.position import PositionFactor
-from aquaflow.telemetry.factors.velocity import VelocityFactor
+from aquaflow.telemetry.factors import (
+    AltitudeFactor,
+    DepthFactor,
+    Factor,
+    HeadingFactor,
+    PositionFactor,
+    TiltFactor,
+    VelocityFactor,
+)
 from aquaflow.telemetry.state import MetricState
 from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, WorldEdge, world_edge
 

@@ -12,7 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
-from aquaflow.telemetry.factors.length import length_factors
+from aquaflow.telemetry.factors import length_factors
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation

@@ -13,7 +13,7 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config import FusionConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.telemetry.recent_motion import RecentMotion
+from aquaflow.telemetry.dead_reckoning import RecentMotion
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -18,9 +18,9 @@ from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import load_camera
 from aquaflow.lab.evaluation.trajectory import associate, read_tum
 from aquaflow.survey.measure.scale_bar import between_pixels, between_points
-from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.known_lengths.known_lengths_file import (
+from aquaflow.telemetry.known_lengths.known_length import (
     FILE,
+    KnownLength,
     read_known_lengths,
     with_length,
     write_known_lengths,

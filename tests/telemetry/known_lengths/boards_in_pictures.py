@@ -10,8 +10,7 @@ import numpy as np
 from aquaflow.config.telemetry import BoardConfig, CharucoConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.telemetry.known_lengths.board_size import BoardView
-from aquaflow.telemetry.known_lengths.boards import charuco_board
+from aquaflow.telemetry.known_lengths.board_size import BoardView, charuco_board
 
 CAMERA = CameraModel(640, 480, 520.0, 520.0, 318.0, 243.0)
 METRES_PER_UNIT = 2.05

@@ -12,8 +12,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.known_lengths.board_size import BoardView
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.known_lengths.laser_dots import find_dots
-from aquaflow.telemetry.known_lengths.laser_spacing import laser_lengths
+from aquaflow.telemetry.known_lengths.laser_spacing import find_dots, laser_lengths
 
 CAMERA = CameraModel(640, 480, 520.0, 520.0, 318.0, 243.0)
 METRES_PER_UNIT = 2.05

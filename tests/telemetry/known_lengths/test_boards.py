@@ -9,8 +9,13 @@ import pytest
 
 from aquaflow.config.telemetry import BoardConfig, CharucoConfig, MarkersConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.telemetry.known_lengths.board_size import BoardView, board_lengths
-from aquaflow.telemetry.known_lengths.boards import BoardDetector, BoardSighting, marker_corners
+from aquaflow.telemetry.known_lengths.board_size import (
+    BoardDetector,
+    BoardSighting,
+    BoardView,
+    board_lengths,
+    marker_corners,
+)
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from tests.telemetry.known_lengths.boards_in_pictures import (
     CAMERA,

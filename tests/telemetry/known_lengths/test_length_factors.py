@@ -8,7 +8,7 @@ import pytest
 from aquaflow.config import FusionConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.estimator import estimate
-from aquaflow.telemetry.factors.length import length_factors
+from aquaflow.telemetry.factors import length_factors
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import WorldFrame

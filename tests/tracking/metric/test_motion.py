@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
-from aquaflow.telemetry.recent_motion import RecentMotion
+from aquaflow.telemetry.dead_reckoning import RecentMotion
 from aquaflow.tracking.metric.world_frames import LONGEST_S, motion_of_camera
 from aquaflow.types import AngularRate, Velocity
 

@@ -1,0 +1,531 @@
+"""A source's residuals as a function of the state, with their derivatives."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
+
+from aquaflow.geometry.similarity import rotation_from_quaternion, so3_exp, so3_log
+from aquaflow.telemetry.camera_path import CameraPath
+from aquaflow.telemetry.known_lengths.known_length import KnownLength
+from aquaflow.telemetry.start import Process, SlowPart
+from aquaflow.telemetry.state import (
+    CAMERA,
+    DVL,
+    DVL_SCALE,
+    HEADING,
+    LAG,
+    SCALE,
+    SHIFT,
+    TURN,
+    MetricState,
+    P,
+)
+from aquaflow.telemetry.telemetry import Series
+
+Array = npt.NDArray[np.float64]
+
+MOST = 250
+"""Samples of one source that the estimator takes, evenly chosen: what is slow in their errors
+limits the result, not how many there are."""
+STEP = 1e-6
+"""Of central differences, in m, rad and log-scale: halves the digits of float64."""
+
+
+class Factor(ABC):
+    """Residuals [N, D] of one source, in its own unit; zero where it agrees with the state."""
+
+    kind: ClassVar[str]
+    """Name of its message in a recording."""
+    slow: SlowPart
+    """Of the kind, or of this source."""
+    spans: ClassVar[tuple[slice, ...]]
+    """Parameters that the residuals depend on."""
+
+    source: str
+    t_s: Array
+    """[N] s"""
+    sigma: Array
+    """[N] white noise, 1 sigma of each component."""
+
+    @abstractmethod
+    def residuals(self, state: MetricState) -> Array:
+        """[N, D]"""
+
+    def jacobian(self, state: MetricState) -> Array:
+        """[N, D, P] derivatives by a step of the state, by central differences."""
+        found = np.zeros((*self.residuals(state).shape, P))
+        for span in self.spans:
+            for k in range(span.start, span.stop):
+                step = np.zeros(P)
+                step[k] = STEP
+                ahead, behind = (
+                    self.residuals(state.move(step)),
+                    self.residuals(state.move(-step)),
+                )
+                found[..., k] = (ahead - behind) / (2.0 * STEP)
+        return found
+
+
+def axes_along(
+    vectors: Array,  # [N, 3]
+) -> Array:
+    """[N, 3, 3] unit vectors in rows: along each vector, and two across it."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    still = length < 1e-12
+    along = np.where(still, [[1.0, 0.0, 0.0]], vectors / np.where(still, 1.0, length))
+    helper = np.where(np.abs(along[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(along, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([along, first, np.cross(along, first)], axis=1)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# An altimeter: its range against the map's own range along its beam.
+
+MOST_BEAMS = 100
+"""Samples that are compared with the map: each looks through all of its points."""
+HALF_BEAM = np.radians(12.5)
+"""rad: Ping sonar, 25 degrees at -3 dB."""
+FIRST_RETURN = 1.0
+"""Percentile of the ranges within the beam: an echo sounder hears what is nearest (measured on a
+synthetic reef: 0.5 % too far, where the 10th is 4 % too far), and a map's nearest are outliers."""
+LEAST_POINTS = 30
+"""Of the map within a beam; fewer are no ground."""
+SIGMA_M, SHARE = 0.01, 0.02
+"""1 sigma, m and share of the range: Ping sonar 0.5 % resolution, roughness within the beam."""
+WIDER = np.radians(10.0)
+"""rad around the beam within which points are looked through again for a turned mounting."""
+TURNED = np.radians(2.0)
+"""rad by which the mounting is turned to see what its error does to the ranges: on a slope, 1 % in
+3 degrees."""
+
+
+class AltitudeFactor(Factor):
+    """Range to the map along the beam minus the altitude, m."""
+
+    kind = "altitude"
+    slow = SlowPart(0.01, 5.0, tuple(Process(t) for t in (1.0, 5.0, 30.0)))
+    """m: the same rock stays within the beam for seconds."""
+    spans = (SCALE, CAMERA)
+
+    def __init__(
+        self,
+        altitude: Series,
+        path: CameraPath,
+        points_m: Array,  # [K, 3] of the map
+        state: MetricState,
+    ) -> None:
+        """Keeps the samples whose beam meets the map at the body's pose in ``state``; the beam
+        looks along the body's z. ``path`` covers all samples."""
+        altitude = altitude.thin(MOST_BEAMS)
+        turns = TURNED * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+        mountings = [so3_exp(turn) @ state.R_bc for turn in turns]
+        ranges = np.array(
+            [
+                _first_returns(points_m, *_beams(R_mc, p_m, mountings, state))
+                for R_mc, p_m in zip(*path.at(altitude.t_s), strict=True)
+            ]
+        ).reshape(-1, len(mountings))
+        met = np.isfinite(ranges).all(axis=1)
+        ranges = ranges[met]
+        self.source, self.t_s = altitude.source, altitude.t_s[met]
+        self._range, self._altitude_m = ranges[:, 0], altitude.values[met, 0]
+        slopes = (ranges[:, 1::2] - ranges[:, 2::2]) / (2.0 * TURNED)
+        self._by_turn = np.column_stack([slopes, np.zeros(len(slopes))])
+        self._R_bc = state.R_bc
+        self.sigma = np.hypot(SIGMA_M, SHARE * self._altitude_m)
+
+    @property
+    def rough_log_scale(self) -> float:
+        """Of metres per map unit, from the median of the ratios."""
+        return float(np.log(np.median(self._altitude_m / self._range)))
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 1] m."""
+        return np.asarray((state.scale * self._ranges(state) - self._altitude_m)[:, None])
+
+    def scale_misfit(self, state: MetricState) -> tuple[Array, Array]:
+        """Logarithm of the scale that each range alone gives, over the state's; 1 sigma."""
+        ranges = state.scale * self._ranges(state)
+        return -self.residuals(state)[:, 0] / ranges, self.sigma / ranges
+
+    def _ranges(self, state: MetricState) -> Array:
+        """[N] map units, with the mounting of ``state``: to first order."""
+        return np.asarray(self._range + self._by_turn @ so3_log(state.R_bc @ self._R_bc.T))
+
+
+def _beams(
+    R_mc: Array,  # [3, 3]
+    p_m: Array,  # [3]
+    mountings: Sequence[Array],  # [3, 3] each, R_bc
+    state: MetricState,
+) -> tuple[Array, Array]:
+    """Origins and directions [J, 3] of the beam in the map, for each mounting of the camera."""
+    R_mb = np.stack([R_mc @ R_bc.T for R_bc in mountings])
+    return p_m - R_mb @ state.c_b / state.scale, R_mb[:, :, 2]
+
+
+def _first_returns(
+    points: Array,  # [K, 3] map
+    apexes: Array,  # [J, 3] map
+    axes: Array,  # [J, 3] unit vectors, about parallel
+) -> Array:
+    """[J] ranges from each apex to the nearest points within its beam; NaN if it meets none."""
+    points = _within(points, apexes[0], axes[0], HALF_BEAM + WIDER)[0]
+    found = np.full(len(axes), np.nan)
+    for j, (apex, axis) in enumerate(zip(apexes, axes, strict=True)):
+        ranges = _within(points, apex, axis, HALF_BEAM)[1]
+        if len(ranges) >= LEAST_POINTS:
+            found[j] = np.percentile(ranges, FIRST_RETURN)
+    return found
+
+
+def _within(
+    points: Array,  # [K, 3]
+    apex: Array,  # [3]
+    axis: Array,  # [3] unit vector
+    half_angle: float,
+) -> tuple[Array, Array]:
+    """Points [n, 3] within a cone, and their ranges [n] from its apex."""
+    away = points - apex
+    along = away @ axis
+    ahead = along > 0.0
+    points, away, along = points[ahead], away[ahead], along[ahead]
+    ranges = np.linalg.norm(away, axis=1)
+    inside = along > np.cos(half_angle) * ranges
+    return points[inside], ranges[inside]
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Attitude: where down is in the body, and where it points; else specific force for down.
+
+TILT_SIGMA = np.radians(0.5)
+"""rad, white: roll and pitch of a MEMS attitude filter in motion."""
+HEADING_SIGMA = np.radians(1.0)
+"""rad, white: a compass in a vehicle with thrusters."""
+FORCE_SIGMA = 0.05
+"""rad, white: an ROV's own accelerations of 0.5 m/s^2 against gravity's 9.8."""
+LEAST_FORCE, MOST_FORCE = 7.0, 13.0
+"""m/s^2; specific force outside is a blow, not gravity."""
+
+
+class TiltFactor(Factor):
+    """Measured down in the body x down of the state: the small angle between the two."""
+
+    kind = "attitude"
+    slow = SlowPart(np.radians(0.3), 20.0, tuple(Process(t) for t in (5.0, 20.0, 100.0)))
+    """rad: roll and pitch of a MEMS filter wander by some tenths of a degree (Xsens MTi-30: 0.5
+    degrees RMS dynamic), as long as it averages accelerations."""
+    spans = (TURN, CAMERA)
+
+    def __init__(
+        self,
+        source: str,
+        t_s: Array,  # [N] s
+        down_b: Array,  # [N, 3] unit vectors in the body
+        path: CameraPath,
+        sigma: float,
+    ) -> None:
+        """``path`` covers all samples."""
+        self.source, self.t_s = source, t_s
+        self.sigma = np.full(len(t_s), sigma)
+        self.down_b = down_b
+        self._R_mc, self._p_m = path.at(t_s)
+
+    @staticmethod
+    def of_attitude(attitude: Series, path: CameraPath) -> TiltFactor:
+        """From an attitude filter."""
+        attitude = attitude.thin(MOST)
+        R_nb = rotation_from_quaternion(attitude.values)
+        return TiltFactor(attitude.source, attitude.t_s, R_nb[:, 2, :], path, TILT_SIGMA)
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 2] rad, across the body's down axis."""
+        R_nb, _ = state.body(self._R_mc, self._p_m)
+        turn = np.cross(self.down_b, R_nb[:, 2, :])
+        axes = axes_along(self.down_b)[:, 1:]
+        return np.asarray(np.einsum("nij,nj->ni", axes, turn))
+
+    def turn_wanted(self, state: MetricState) -> Array:
+        """[N, 3] rad, the turn in the axes of n after which down is where it was measured."""
+        R_nb, _ = state.body(self._R_mc, self._p_m)
+        measured = np.einsum("nij,nj->ni", R_nb, self.down_b)
+        return np.cross(measured, [0.0, 0.0, 1.0])
+
+
+class ForceFactor(TiltFactor):
+    """The same from specific force, which is down only on average."""
+
+    kind = "acceleration"
+    slow = SlowPart(0.01, 4.0, tuple(Process(t) for t in (1.0, 4.0, 20.0)))
+    """rad: accelerations of an ROV last as long as its manoeuvres."""
+
+    @staticmethod
+    def of_force(force: Series, path: CameraPath) -> ForceFactor | None:
+        """From an accelerometer; None if nothing of it looks like gravity."""
+        norm = np.linalg.norm(force.values, axis=1)
+        sound = (norm > LEAST_FORCE) & (norm < MOST_FORCE)
+        if not sound.any():
+            return None
+        force = Series(force.source, force.t_s[sound], force.values[sound]).thin(MOST)
+        down_b = -force.values / np.linalg.norm(force.values, axis=1, keepdims=True)
+        return ForceFactor(force.source, force.t_s, down_b, path, FORCE_SIGMA)
+
+
+class HeadingFactor(Factor):
+    """Turn about the vertical between the body of the state and the compass's."""
+
+    kind = "heading"
+    slow = SlowPart(np.radians(1.0), 60.0, tuple(Process(t) for t in (10.0, 60.0, 300.0)))
+    """rad: thrusters, tethers and wrecks bend the field as the vehicle goes."""
+    spans = (TURN, CAMERA, HEADING)
+
+    def __init__(self, attitude: Series, path: CameraPath) -> None:
+        """``path`` covers all samples."""
+        attitude = attitude.thin(MOST)
+        self.source, self.t_s = attitude.source, attitude.t_s
+        self.sigma = np.full(len(attitude), HEADING_SIGMA)
+        self._R_bn = np.swapaxes(rotation_from_quaternion(attitude.values), 1, 2)
+        self._R_mc, self._p_m = path.at(attitude.t_s)
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 1] rad."""
+        R_nb, _ = state.body(self._R_mc, self._p_m)
+        about = Rotation.from_matrix(R_nb @ self._R_bn).as_rotvec()[:, 2:]
+        apart = about + state.heading
+        return np.asarray(np.arctan2(np.sin(apart), np.cos(apart)))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# No source: the vehicle is taken to keep its depth, where nothing else says what is down.
+
+
+class ConstantDepthFactor(Factor):
+    """z of the body in n minus its mean, m."""
+
+    kind = "constant_depth"
+    slow = SlowPart(0.05, 20.0, tuple(Process(t) for t in (5.0, 20.0, 100.0)))
+    """m: a vehicle that follows the ground goes up and down for as long as a slope lasts."""
+    spans = (SCALE, TURN, CAMERA)
+
+    def __init__(self, path: CameraPath, sigma_m: float) -> None:
+        step = max(1, -(-len(path) // MOST))
+        self.source, self.t_s = "assumed", path.t_s[::step]
+        self.sigma = np.full(len(self.t_s), sigma_m)
+        self._R_mc, self._p_m = path.R_mc[::step], path.p_m[::step]
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 1] m."""
+        _, p_n = state.body(self._R_mc, self._p_m)
+        return np.asarray(p_n[:, 2:] - p_n[:, 2:].mean())
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Pressure: how far the body lies below the surface, so metres along gravity.
+
+DEPTH_SIGMA_M = 0.01
+"""m, white: Bar30 (MS5837-30BA) resolves 2 mm; over MAVLink its short-term noise is about 1 cm."""
+
+
+class DepthFactor(Factor):
+    """z of the body in n minus the depth."""
+
+    kind = "depth"
+    slow = SlowPart(
+        0.007,
+        60.0,
+        (
+            *(Process(time_s) for time_s in (2.0, 8.0, 60.0)),
+            *(Process(20.0, period_s) for period_s in (2.5, 3.2, 4.0, 5.0, 6.5, 8.5, 11.0)),
+        ),
+    )
+    """m: tide, temperature and the camera's own drift; waves reach down to half their length."""
+    spans = (SCALE, TURN, SHIFT, CAMERA)
+
+    def __init__(self, depth: Series, path: CameraPath) -> None:
+        """``path`` covers all samples."""
+        depth = depth.thin(MOST)
+        self.source, self.t_s = depth.source, depth.t_s
+        self.sigma = np.full(len(depth), DEPTH_SIGMA_M)
+        self._depth_m = depth.values[:, 0]
+        self._R_mc, self._p_m = path.at(depth.t_s)
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 1] m."""
+        _, p_n = state.body(self._R_mc, self._p_m)
+        return np.asarray(p_n[:, 2:] - self._depth_m[:, None])
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Lengths that somebody knows: the side of a marker, two laser dots, a scale bar.
+
+APART_S, LASTING_S = 100.0, 1e9
+"""Stated moments of measurements, each of which errs on its own, and the correlation time of what
+they all share: the length that was measured by hand."""
+
+
+class LengthFactor(Factor):
+    """Lengths in the map, in metres, minus the known one."""
+
+    kind = "length"
+    spans = (SCALE,)
+
+    def __init__(
+        self,
+        source: str,
+        map_lengths: Array,  # [N] map units
+        map_sigma: Array,  # [N] map units
+        length_m: float,
+        sigma_m: float,
+    ) -> None:
+        self.source, self._map, self._m = source, map_lengths, length_m
+        self.t_s = APART_S * np.arange(len(map_lengths), dtype=np.float64)
+        self.rough_scale = float(length_m / np.median(map_lengths))
+        self.sigma = self.rough_scale * map_sigma
+        self.slow = SlowPart(sigma_m, LASTING_S, (Process(1.0),))
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 1] m."""
+        return np.asarray((state.scale * self._map - self._m)[:, None])
+
+
+def length_factors(lengths: Sequence[KnownLength]) -> list[LengthFactor]:
+    """The known lengths of one sub-map, as one factor for each that was measured by hand."""
+    groups: dict[float, list[KnownLength]] = {}
+    for length in lengths:
+        groups.setdefault(length.length_m, []).append(length)
+    return [
+        LengthFactor(
+            ", ".join(sorted({each.source for each in group})),
+            np.array([each.map_length for each in group]),
+            np.array([each.map_sigma for each in group]),
+            length_m,
+            float(np.median([each.sigma_m for each in group])),
+        )
+        for length_m, group in groups.items()
+    ]
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Fixes on the earth: GNSS at the surface, USBL or another acoustic system below.
+
+
+class PositionFactor(Factor):
+    """North and east of the body, at the moment that the fix is of, minus the fix, m."""
+
+    kind = "position"
+    slow = SlowPart(0.001, 60.0, tuple(Process(t) for t in (10.0, 60.0, 600.0)))
+    """m: GNSS and acoustic fixes err for minutes; how much differs by system, their residuals say.
+    """
+    spans = (SCALE, TURN, SHIFT, CAMERA, LAG)
+
+    def __init__(
+        self,
+        source: str,
+        t_s: Array,  # [N] s
+        fixes_n: Array,  # [N, 2] m, north and east of n's origin
+        sigma: Array,  # [N] m
+        path: CameraPath,
+    ) -> None:
+        """``path`` covers all fixes."""
+        step = max(1, -(-len(t_s) // MOST))
+        self.source, self.t_s, self.sigma = source, t_s[::step], sigma[::step]
+        self._fixes_n = fixes_n[::step]
+        self._R_mc, self._p_m = path.at(self.t_s)
+        self._v_m = path.velocity(self.t_s)
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 2] m."""
+        _, p_n = state.body(self._R_mc, self._p_m - state.lag_s * self._v_m)
+        return np.asarray(p_n[:, :2] - self._fixes_n)
+
+
+class PlaceFactor(PositionFactor):
+    """The one place at which dead reckoning puts the body when a sub-map starts."""
+
+    kind = "dead_reckoning"
+    slow = SlowPart(1e-4, 1.0, (Process(1.0),))
+    """m: all of its uncertainty is in its sigma."""
+
+
+# --- ----------------------------------------------------------------------------------------------
+# A DVL: displacements over ground, which are metres whatever the vehicle does.
+
+INTERVAL_S = 1.0
+"""Least time of a displacement: at an ROV's 0.3 m/s well above the noise of two poses."""
+LONGEST_GAP_S = 0.7
+"""Between two velocities inside an interval: a DVL sends 4 to 15 a second while it has the bottom.
+"""
+LEAST_SIGMA_M_S = 0.005
+"""A figure of merit below is not believed: A50, 0.1 cm/s at best."""
+
+
+class VelocityFactor(Factor):
+    """Displacement of the camera between two poses minus the DVL's, m: along it, and across.
+
+    The camera's own scale errs along the way, with the same sign after the vehicle has turned
+    round; in the axes of the map such an error would seem to average out between two lanes.
+    """
+
+    kind = "velocity"
+    slow = SlowPart(0.0015, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
+    """m in an interval: the camera's own scale wanders along the path, by 0.3 % of 0.5 m."""
+    spans = (SCALE, CAMERA, DVL, DVL_SCALE)
+
+    def __init__(self, velocity: Series, path: CameraPath) -> None:
+        """``path`` covers all samples."""
+        self.source = velocity.source
+        self._tau, self._v = velocity.t_s, velocity.values[:, :3]
+        self._R_mc, _ = path.at(velocity.t_s)
+        first, last = _intervals(velocity.t_s)
+        begin, end = velocity.t_s[first], velocity.t_s[last]
+        self._first, self._last = first, last
+        self.t_s = 0.5 * (begin + end)
+        R_begin, p_begin = path.at(begin)
+        R_end, p_end = path.at(end)
+        self._moved_m, self._turned = p_end - p_begin, R_end - R_begin
+        self._axes = axes_along(self._moved_m)
+        merit = np.maximum(velocity.values[:, 3], LEAST_SIGMA_M_S)
+        spacing = (end - begin) / np.maximum(last - first, 1)
+        means = np.array([merit[i : j + 1].mean() for i, j in zip(first, last, strict=True)])
+        self.sigma = means * np.sqrt(spacing * (end - begin))
+
+    def residuals(self, state: MetricState) -> Array:
+        """[N, 3] m."""
+        R_cb = state.R_bc.T
+        v_c = np.exp(state.log_dvl) * self._v @ (R_cb @ state.R_bd).T
+        v_m = np.einsum("nij,nj->ni", self._R_mc, v_c)
+        way = np.asarray(cumulative_trapezoid(v_m, self._tau, axis=0, initial=0))
+        arm = self._turned @ (R_cb @ state.c_b)
+        body = way[self._last] - way[self._first]
+        apart = state.scale * self._moved_m - body - arm
+        return np.asarray(np.einsum("nij,nj->ni", self._axes, apart))
+
+    def scale_misfit(self, state: MetricState) -> tuple[Array, Array]:
+        """Logarithm of the scale that each displacement alone gives, over the state's; 1 sigma."""
+        moved = np.maximum(state.scale * np.linalg.norm(self._moved_m, axis=1), 1e-6)
+        return -self.residuals(state)[:, 0] / moved, self.sigma / moved
+
+
+def _intervals(
+    t_s: Array,  # [M] s
+) -> tuple[Array, Array]:
+    """[N] first and last sample of stretches of at least INTERVAL_S without a gap."""
+    least = max(INTERVAL_S, (t_s[-1] - t_s[0]) / MOST) if len(t_s) else INTERVAL_S
+    gaps = np.flatnonzero(np.diff(t_s) > LONGEST_GAP_S)
+    first, last = [], []
+    for run in np.split(np.arange(len(t_s)), gaps + 1):
+        start = 0
+        for k in range(1, len(run)):
+            if t_s[run[k]] - t_s[run[start]] >= least:
+                first.append(run[start])
+                last.append(run[k])
+                start = k
+    return np.array(first, dtype=np.intp), np.array(last, dtype=np.intp)
