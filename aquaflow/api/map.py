@@ -238,7 +238,7 @@ def map_recording(
         recording, name = source, type(source).__name__
     path = Path(source) if isinstance(source, (str, os.PathLike)) else None
     given = open_telemetry(path, [Path(log) for log in telemetry], telemetry_offset_s)
-    from aquaflow.tracking.base.opening import base_of
+    from aquaflow.tracking.base import base_of
 
     base = None if in_site is None else base_of(Path(in_site))
     from aquaflow.dive import replay  # loads torch: after what can be refused without it

@@ -182,7 +182,7 @@ def map_command(
     from aquaflow.dive.replay import (
         map_recording,  # loads torch: after what can be refused without it
     )
-    from aquaflow.tracking.base.opening import base_of
+    from aquaflow.tracking.base import base_of
 
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(

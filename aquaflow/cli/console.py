@@ -86,7 +86,7 @@ def checked_site(folder: Path, out: Path | None) -> Path:
     Raises:
         InputError: it is no dive in which places can be found again, or the one in ``--out``.
     """
-    from aquaflow.tracking.base.opening import base_of
+    from aquaflow.tracking.base import base_of
 
     if out is not None and out.resolve() == folder.resolve():
         raise InputError(f"--in and --out are both {folder}; a dive is never changed by another")

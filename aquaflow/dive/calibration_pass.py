@@ -33,9 +33,8 @@ from aquaflow.sources import CameraSource
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import TOLERANCE, LensError, most_turning, view_of
 from aquaflow.tracking.frames import Tracked
-from aquaflow.tracking.lens_views import MOST_VIEWS, LensViews
-from aquaflow.tracking.overlay.finder import OverlayFinder
-from aquaflow.tracking.self_calibration import FoundLens, found_lens
+from aquaflow.tracking.overlay import OverlayFinder
+from aquaflow.tracking.self_calibration import MOST_VIEWS, FoundLens, LensViews, found_lens
 from aquaflow.types import Frame
 
 MOST_FRAMES = 600

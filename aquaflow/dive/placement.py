@@ -18,8 +18,7 @@ from aquaflow.geometry.alignment import latitude_longitude
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
-from aquaflow.tracking.base.in_base import InBase
-from aquaflow.tracking.base.links import BaseLink
+from aquaflow.tracking.base import BaseLink, InBase
 
 Array = npt.NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from aquaflow.telemetry.time_offset import (
     synchronise_samples,
 )
 from aquaflow.telemetry.turns import Array, Turns
-from aquaflow.tracking.base.base import Base
+from aquaflow.tracking.base import Base
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import CameraModel, Dropped, Frame
 

@@ -21,19 +21,17 @@ from aquaflow.prior.factory import make_prior
 from aquaflow.slam.map_inputs import MapInputs, make_maps
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
-from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.in_base import BaseLookup, InBase
-from aquaflow.tracking.frame_table import FrameTable
+from aquaflow.tracking.base import Base, BaseLookup, InBase
+from aquaflow.tracking.frame_table import FrameTable, RelativeFrame, RelativePoses
 from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Revisit, Step, Tracked
-from aquaflow.tracking.gate.gate import FrameGate, GateKind, GateVerdict
+from aquaflow.tracking.gate import FrameGate, GateKind, GateVerdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph, LoopsFound
 from aquaflow.tracking.initialisation.back_fill import BackFillResult
 from aquaflow.tracking.keyframe_reuse import ReuseResult
 from aquaflow.tracking.loops.relocaliser import Places
-from aquaflow.tracking.metric.learned_scales import learned_scales
+from aquaflow.tracking.metric.straightening import learned_scales
 from aquaflow.tracking.metric.world_frames import WorldFrames
-from aquaflow.tracking.overlay.finder import OverlayFinder
-from aquaflow.tracking.relative_poses import RelativeFrame, RelativePoses
+from aquaflow.tracking.overlay import OverlayFinder
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Frame
 

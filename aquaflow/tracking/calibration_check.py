@@ -16,9 +16,15 @@ from scipy.special import fdtrc
 
 from aquaflow.geometry.optics import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.keyframes import Keyframe
-from aquaflow.tracking.lens_adjustment import adjust_lens, clusters_of, model_error
-from aquaflow.tracking.lens_equations import Array, LensObservations
-from aquaflow.tracking.lens_matches import LensView, match_pixels
+from aquaflow.tracking.lens_equations import (
+    Array,
+    LensObservations,
+    LensView,
+    adjust_lens,
+    clusters_of,
+    match_pixels,
+    model_error,
+)
 
 MAX_VIEWS = 8
 """Keyframes used: with the pairs below, ten pairs."""

@@ -15,15 +15,17 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+import numpy.typing as npt
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Keyframe
-from aquaflow.tracking.depth_ratio import DepthRatio, depth_ratio
-from aquaflow.tracking.loops.neighbours import Array, Neighbour, Neighbours, sketch
+from aquaflow.geometry.two_view import pose_candidates
+from aquaflow.keyframes import Keyframe, Pointmap
+from aquaflow.optimise.robust import sigma_of
+from aquaflow.prior.contract import PairGeometry
+from aquaflow.tracking.loops.verification import Neighbour, Neighbours, sketch
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.pose.rigidity import rigid_share
 
 REMEMBERED = 20
 """Findings that are listed."""
@@ -245,3 +247,73 @@ class ConsistencyMonitor:
 
 def _is_off(ratio: DepthRatio, most: float, sigmas: float) -> bool:
     return abs(ratio.log) > max(most, sigmas * ratio.sigma)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Do two pointmaps agree about how far the scene is? Points of one, looked up in the other.
+
+Array = npt.NDArray[np.float64]
+
+MIN_POINTS = 16
+"""Points in common below which nothing is said: a quarter of a sketch."""
+MEDIAN = 1.2533
+"""Standard deviation of a median over that of a mean."""
+
+
+@dataclass(frozen=True)
+class DepthRatio:
+    """How much further a pointmap has the scene than other points say."""
+
+    log: float
+    """Median of log (depth in the pointmap / depth of the points)."""
+    sigma: float
+    """Standard deviation of that median, from the spread."""
+    points: int
+
+
+def depth_ratio(
+    points: Array,  # [M, 3] in any frame
+    T_kp: Sim3,
+    pointmap: Pointmap,
+    known_sigma: float,
+) -> DepthRatio | None:
+    """Depths of ``pointmap`` against those of ``points``, which ``T_kp`` takes to its keyframe;
+    None where it shows too few of them."""
+    X = T_kp.apply(points)
+    X = X[X[:, 2] > 1e-6]
+    camera = pointmap.camera
+    pixels = camera.project(X)
+    inside = ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all(-1)
+    X, (u, v) = X[inside], np.floor(pixels[inside]).astype(np.intp).T
+    rho, variance = pointmap.rho[v, u], pointmap.variance[v, u]
+    known = (rho > 1e-6) & (variance < (known_sigma * rho) ** 2)
+    if known.sum() < MIN_POINTS:
+        return None
+    logs = -np.log(X[known, 2] * rho[known])
+    middle = float(np.median(logs))
+    spread = sigma_of(logs - middle)
+    count = len(logs)
+    return DepthRatio(middle, MEDIAN * spread / float(np.sqrt(count)), count)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Are the matches of a frame those of one rigid scene, whatever the keyframe's depths say? What
+# floats in front of the scene moves as it likes; wrong depths leave the matches as they are.
+
+SAMPLED = 400
+"""Matches that the two-view pose is estimated from: some 5 ms."""
+
+
+def rigid_share(
+    pair: PairGeometry,
+    camera_k: CameraModel,
+    camera: CameraModel,
+) -> float:
+    """Share of the valid matches that one motion of the camera explains; 0 of too few."""
+    rows, columns = np.nonzero(pair.valid)
+    step = max(1, -(-len(rows) // SAMPLED))
+    rows, columns = rows[::step], columns[::step]
+    pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)
+    pixels = pair.matches[rows, columns].astype(np.float64)
+    candidates = pose_candidates(pixels_k, pixels, camera_k, camera)
+    return candidates[0].support if candidates else 0.0

@@ -23,14 +23,18 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
-from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.learned.moving import SeenBefore, moving
-from aquaflow.tracking.learned.scaling import LearnedDepth
-from aquaflow.tracking.loops.neighbours import Neighbour, Neighbours
+from aquaflow.tracking.learned.scaling import LearnedDepth, add_learned
+from aquaflow.tracking.loops.verification import Neighbour, Neighbours
 from aquaflow.tracking.pose.depth_fusion import fuse, transfer
-from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
-from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched
-from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
+from aquaflow.tracking.pose.matcher import (
+    KeyframeMatcher,
+    Matched,
+    agreeing,
+    expected_matches,
+    is_wide,
+    predicted_matches,
+)
 from aquaflow.tracking.wide_steps import WideSteps
 from aquaflow.types import Frame
 

@@ -16,9 +16,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.loops.neighbours import Neighbour
-from aquaflow.tracking.pose.expected_matches import expected_matches
-from aquaflow.tracking.pose.matcher import Matched
+from aquaflow.tracking.loops.verification import Neighbour
+from aquaflow.tracking.pose.matcher import Matched, expected_matches
 
 STAGE = "return to a keyframe"
 """Name of this work."""

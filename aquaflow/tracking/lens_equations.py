@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import (
     LENS_PRIOR_SIGMA,
     TERMS,
@@ -16,9 +18,11 @@ from aquaflow.geometry.optics import (
     seen_at,
     slope,
 )
-from aquaflow.geometry.similarity import hat, so3_exp
-from aquaflow.optimise.least_squares import NormalEquations
-from aquaflow.optimise.robust import HUBER_LENGTH, Huber
+from aquaflow.geometry.similarity import Sim3, hat, so3_exp
+from aquaflow.optimise.least_squares import NormalEquations, Rules, minimise
+from aquaflow.optimise.robust import HUBER_LENGTH, Huber, sigma_of_lengths
+from aquaflow.prior.contract import Keypoints, Mask
+from aquaflow.tracking.loops.verification import Index, match_keypoints
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -274,3 +278,217 @@ def _apply(
 ) -> Array:
     """[M, r] = R [M, r, 3] @ vectors [M, 3]."""
     return np.asarray(np.einsum("mij,mj->mi", R, vectors))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Self-calibrating bundle adjustment: poses, inverse depths, and one error of the lens for all.
+#
+# Every point belongs to the view that it was sampled in, so that the points' block of the normal
+# equations is diagonal.
+
+ROUNDS = 4
+"""Of weighting: in the first the lens is held, in the last two outliers are left out."""
+RULES = Rules(iterations=40, decrease=1e-6, growth=4.0, shrinkage=0.25)
+"""Of each round; from a focal length 30 % off it takes about ten iterations. Where the lens is
+badly known, the cost, some ten thousand, is flat. With damping that changes tenfold, every other
+step along the narrow valley in which focal length and poses compensate each other fails
+(measured)."""
+OUTLIER_SIGMAS = 6.0
+"""Mismatches of keypoints lie tens of standard deviations off; the error of a lens does not."""
+MIN_SIGMA = 1e-6
+"""Normalised units; noise below a thousandth of a pixel is a test without any."""
+
+
+@dataclass(frozen=True)
+class LensAdjustment:
+    """The solution and its uncertainty."""
+
+    adjusted: LensUnknowns
+    covariance: Array
+    """[2, 2] of u and k, from the scatter between the views: matches of one view share errors."""
+    sigma_held: float
+    """Noise of the matches, normalised units, that the calibration as it is leaves."""
+    sigma: float
+    """Noise of the matches with u and k solved for."""
+
+
+def adjust_lens(
+    observations: LensObservations,
+    R_wc: Array,  # [V, 3, 3]
+    centres: Array,  # [V, 3]
+    terms: int,
+    start: Array | None = None,  # [5] lens error, 0 if None
+) -> LensAdjustment:
+    """The first ``terms`` of the lens error that fit ``observations`` best; the others stay as in
+    ``start``, with which the poses go.
+
+    Raises:
+        numpy.linalg.LinAlgError: the matches determine nothing at all.
+    """
+    lens = np.zeros(TERMS) if start is None else start
+    state = LensUnknowns(R_wc, centres, np.ones(len(observations.points)), lens)
+    sigmas: list[float] = []
+    weighting = Weighting(1.0, np.zeros(0, dtype=bool))
+    for number in range(ROUNDS):
+        state = replace(state, rho=triangulate(observations, state))
+        size = np.linalg.norm(residuals(observations, state), axis=-1)
+        ahead = state.rho[observations.point] > 0.0
+        sigma = _sigma(size[ahead])
+        used = ahead if number < ROUNDS - 2 else ahead & (size < OUTLIER_SIGMAS * sigma)
+        weighting = Weighting(sigma, used)
+        problem = SelfCalibration(observations, weighting, terms if number else 0)
+        state = minimise(problem, state, RULES).state
+        sigmas.append(_sigma(np.linalg.norm(residuals(observations, state), axis=-1)[used]))
+    covariance = _covariance(observations, state, weighting, terms)
+    return LensAdjustment(state, covariance, sigmas[0], sigmas[-1])
+
+
+def _covariance(
+    observations: LensObservations, state: LensUnknowns, weighting: Weighting, terms: int
+) -> Array:
+    """[2, 2] of the lens: the sandwich estimator over the clusters of the points."""
+    clusters = clusters_of(observations)
+    count = len(np.unique(clusters))
+    equations = LensEquations(observations, state, weighting, terms)
+    H = equations.hessian
+    free = slice(0, len(H) - TERMS + terms)
+    inverse: Array = np.asarray(
+        np.linalg.inv(equations.hold_gauge(H)[free, free]), dtype=np.float64
+    )
+    scatter = np.zeros_like(inverse)
+    for cluster in np.unique(clusters):
+        gradient = equations.gradient_of(clusters == cluster)
+        scatter += np.outer(gradient[free], gradient[free]) * count / (count - 1.0)
+    lens = slice(len(inverse) - terms, len(inverse) - terms + 2)
+    sandwich = (inverse @ scatter @ inverse)[lens, lens]
+    # Few clusters may agree by chance better than the noise of their matches lets them.
+    return _larger(sandwich, inverse[lens, lens])
+
+
+def model_error(simple: LensAdjustment, full: LensAdjustment) -> Array:
+    """[2, 2] Of a lens of two terms: where more terms explain part of the noise, that part of the
+    estimates' difference is a matter of the model and not of the calibration."""
+    explained = max(0.0, 1.0 - (full.sigma / simple.sigma) ** 2)
+    difference = full.adjusted.lens[:2] - simple.adjusted.lens[:2]
+    return np.diag(explained * difference**2)
+
+
+def clusters_of(observations: LensObservations) -> Indices:
+    """[P] number of the view and quarter of the picture that each point was sampled in."""
+    right, lower = (observations.points > 0.0).T
+    return np.asarray(4 * observations.reference + 2 * lower + right, dtype=np.int64)
+
+
+def _larger(
+    a: Array,  # [2, 2]
+    b: Array,  # [2, 2]
+) -> Array:
+    """[2, 2] a covariance that is nowhere smaller than either."""
+    root = np.linalg.cholesky(b)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, a).T)
+    values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    return np.asarray(root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T)
+
+
+def _sigma(
+    size: Array,  # [M] lengths of residuals, normalised plane
+) -> float:
+    return max(sigma_of_lengths(size), MIN_SIGMA)
+
+
+# --- ----------------------------------------------------------------------------------------------
+# Keypoint matches between pictures as observations of points, for an adjustment of the lens.
+
+MATCHES_PER_PAIR = 200
+"""At most; of more, an even choice: matches of one pair of views share errors."""
+MIN_MATCHES = 300
+"""Of all pairs together."""
+MIN_PAIR_MATCHES = 20
+"""Of one pair: as many mismatches are found between pictures of different places."""
+
+Seen = tuple[int, int]
+"""A keypoint: the number of its view, and its own there."""
+
+
+@dataclass(frozen=True)
+class LensView:
+    """A picture whose keypoints show the lens."""
+
+    keypoints: Keypoints
+    camera: CameraModel
+    """The one whose error is asked for."""
+    T_wc: Sim3
+    """Roughly right."""
+
+    def where(
+        self,
+        shown: Mask | None,  # [H, W] True where the scene is seen; None: everywhere
+    ) -> LensView:
+        """The view with its keypoints there."""
+        if shown is None:
+            return self
+        height, width = shown.shape
+        column, row = np.floor(self.keypoints.pixels).astype(np.intp).T
+        kept = shown[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        pixels, descriptors = self.keypoints.pixels[kept], self.keypoints.descriptors[kept]
+        return replace(self, keypoints=Keypoints(pixels, descriptors))
+
+
+class _Points:
+    """Points by the keypoints that see them; the first keypoint is where a point is sampled."""
+
+    def __init__(self) -> None:
+        self.seen: list[list[Seen]] = []
+        self._owner: dict[Seen, int] = {}
+
+    def is_known(self, keypoint: Seen) -> bool:
+        return keypoint in self._owner
+
+    def add(self, a: Seen, b: Seen) -> None:
+        """They see the same; what contradicts an earlier match is left out."""
+        if b in self._owner:
+            return
+        point = self._owner.get(a)
+        if point is None:
+            point = self._owner[a] = len(self.seen)
+            self.seen.append([a])
+        if all(view != b[0] for view, _ in self.seen[point]):
+            self.seen[point].append(b)
+            self._owner[b] = point
+
+
+def match_pixels(
+    views: Sequence[LensView], pairs: Iterable[tuple[int, int]]
+) -> LensObservations | None:
+    """Points seen in several of ``views``, by matches of ``pairs`` (i, j) with i < j; None for too
+    few. A keypoint belongs to one point, so that no match counts twice."""
+    points = _Points()
+    for i, j in sorted(pairs):
+        mine, theirs = match_keypoints(views[i].keypoints, views[j].keypoints)
+        if len(mine) < MIN_PAIR_MATCHES:
+            continue
+        known = np.array([points.is_known((i, a)) for a in mine.tolist()])
+        for row in _choose(known).tolist():
+            points.add((i, int(mine[row])), (j, int(theirs[row])))
+    seen = [each for each in points.seen if len(each) > 1]
+    if sum(len(each) - 1 for each in seen) < MIN_MATCHES:
+        return None
+    plane = [view.camera.unproject(view.keypoints.pixels)[:, :2] for view in views]
+    matches = [(row, *keypoint) for row, each in enumerate(seen) for keypoint in each[1:]]
+    return LensObservations(
+        np.stack([plane[view][keypoint] for (view, keypoint), *_ in seen]),
+        np.array([view for (view, _), *_ in seen], dtype=np.int64),
+        np.array([row for row, _, _ in matches], dtype=np.int64),
+        np.array([view for _, view, _ in matches], dtype=np.int64),
+        np.stack([plane[view][keypoint] for _, view, keypoint in matches]),
+    )
+
+
+def _choose(
+    known: np.ndarray[tuple[int], np.dtype[np.bool_]],  # [M] whether another view sees it too
+) -> Index:
+    """Rows of the matches used: first of points that other views see, then an even choice."""
+    longer, single = np.flatnonzero(known), np.flatnonzero(~known)
+    room = max(0, MATCHES_PER_PAIR - len(longer))
+    step = -(-len(single) // room) if room else len(single) + 1
+    return np.concatenate([longer[:: max(1, -(-len(longer) // MATCHES_PER_PAIR))], single[::step]])

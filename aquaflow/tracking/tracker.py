@@ -25,8 +25,7 @@ from aquaflow.tracking.keyframe_reuse import KeyframeReuse, ReuseResult, carry
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart, NewMap
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.repairs import LastFrame, Repairs
-from aquaflow.tracking.revisits import find_revisit
+from aquaflow.tracking.repairs import LastFrame, Repairs, find_revisit
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 

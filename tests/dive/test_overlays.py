@@ -13,8 +13,8 @@ from aquaflow.dive.replay import map_recording
 from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
-from aquaflow.tracking.lens_matches import LensView
-from aquaflow.tracking.overlay.finder import OverlayFinder
+from aquaflow.tracking.lens_equations import LensView
+from aquaflow.tracking.overlay import OverlayFinder
 from aquaflow.types import Frame
 from tests.slam_scenes import ToldTracker, frame_of
 

@@ -26,8 +26,7 @@ from aquaflow.tracking.calibration_check import (
     pairs_of,
     view_of,
 )
-from aquaflow.tracking.lens_adjustment import adjust_lens
-from aquaflow.tracking.lens_matches import match_pixels
+from aquaflow.tracking.lens_equations import adjust_lens, match_pixels
 from tests.tracking.lens_scenes import FOCAL_PX, HALF, swim
 
 CALIBRATION = CameraModel(480, 360, FOCAL_PX, FOCAL_PX, 240.0, 180.0, "radtan", (0.05, 0, 0, 0))

@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.depth_ratio import depth_ratio
+from aquaflow.tracking.consistency import depth_ratio
 from tests.tracking.tracked_clips import SMALL, plane_depth
 from tests.tracking.tracking_scenes import pose
 

@@ -10,9 +10,17 @@ from aquaflow.geometry.camera import CameraModel, guess_camera
 from aquaflow.geometry.optics import LENS_PRIOR_SIGMA
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints
-from aquaflow.tracking.lens_matches import MIN_PAIR_MATCHES, LensView, match_pixels
-from aquaflow.tracking.lens_views import LAST_SPACING, MOST_VIEWS, LensViews, motion
-from aquaflow.tracking.self_calibration import MIN_VIEWS, estimate, found_lens, pairs_of
+from aquaflow.tracking.lens_equations import MIN_PAIR_MATCHES, LensView, match_pixels
+from aquaflow.tracking.self_calibration import (
+    LAST_SPACING,
+    MIN_VIEWS,
+    MOST_VIEWS,
+    LensViews,
+    estimate,
+    found_lens,
+    motion,
+    pairs_of,
+)
 from tests.tracking.lens_scenes import swim
 
 GUESS = guess_camera(480, 360)

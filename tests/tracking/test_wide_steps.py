@@ -13,8 +13,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.pose.matcher import KeyframeMatcher
-from aquaflow.tracking.pose.visibility import Visibility
+from aquaflow.tracking.pose.matcher import KeyframeMatcher, Visibility
 from aquaflow.tracking.wide_steps import WideSteps, keypoint_poses
 from aquaflow.types import Frame
 from tests.tracking.tracked_clips import error_share, run

@@ -13,7 +13,7 @@ from aquaflow.lab.stress.case import Check, case
 from aquaflow.lab.stress.swim import CAMERA, pose
 from aquaflow.prior.homography import flow_of_homography
 from aquaflow.tracking.initialisation.bundle import Bundle, adjust
-from aquaflow.tracking.pose.pnp import pose_from_scratch
+from aquaflow.tracking.pose.matcher import pose_from_scratch
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 
 Array = npt.NDArray[np.float64]

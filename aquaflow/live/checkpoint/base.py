@@ -17,10 +17,7 @@ from aquaflow.keyframes.place import KeypointDepths
 from aquaflow.live.checkpoint.generations import Checkpoint
 from aquaflow.slam import Slam
 from aquaflow.telemetry.metric_file import frame_of_json, frame_to_json
-from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.in_base import FirstRecognised, InBase
-from aquaflow.tracking.base.links import BaseLink
-from aquaflow.tracking.base.opening import base_of
+from aquaflow.tracking.base import Base, BaseLink, FirstRecognised, InBase, base_of
 
 
 def localise_in_base(slam: Slam, asked: Path | None, checkpoint: Checkpoint | None) -> list[str]:

@@ -14,8 +14,7 @@ from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
 from aquaflow.survey.site.merged_file import MergedSite, merge_of
-from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.opening import prior_of
+from aquaflow.tracking.base import Base, prior_of
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import KeyframePlace
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.tracking.graph.pose_graph import edge_information
-from aquaflow.tracking.loops.retrieval import Retrieval
+from aquaflow.tracking.loops.relocaliser import Retrieval
 from aquaflow.tracking.loops.verification import verify_keypoints
 
 Array = npt.NDArray[np.float64]

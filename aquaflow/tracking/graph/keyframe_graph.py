@@ -25,9 +25,8 @@ from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import KeyframeEdge, Revisit
-from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
-from aquaflow.tracking.graph.table import GraphResult, Snapshot
+from aquaflow.tracking.graph.table import GraphResult, Improvement, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places, Relocalised
 
 LOOP_SEARCH = "loop search"

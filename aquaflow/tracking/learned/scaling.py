@@ -12,16 +12,18 @@ Networks that know inverse depth up to scale and shift get their shift there as 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.camera import CameraModel, at_pixels
 from aquaflow.keyframes import LearnedDepths, Pointmap
+from aquaflow.optimise.least_squares import RobustFit, Rules, covariance_of, minimise
 from aquaflow.optimise.robust import Tukey, sigma_of
 from aquaflow.prior.contract import Float, Mask, RangeUnit
-from aquaflow.tracking.learned.affine import INDEPENDENT, shift_of, shifted_depth
 
 Array = npt.NDArray[np.float64]
 
@@ -236,3 +238,118 @@ def _apply(
         float(np.sqrt(covariance[0, 0])),
         honesty,
     )
+
+
+# --- ----------------------------------------------------------------------------------------------
+# The shift of inverse depths that a network knows up to scale and shift only.
+#
+# Such a network's inverse depth is d = g rho + c of the true one, rho. Where the keyframe's depths
+# are triangulated, c is found by a robust line; then 1 / (d - c) is a depth of unknown unit, as
+# other networks have it (scaling.py), which also finds what is left of the shift's error. The line
+# is that of d over rho: rho has the smaller errors, and errors of what a line is over make it too
+# flat.
+
+LAGS = (2, 3, 5, 7)
+"""Pixels are paired with those this part of the list further on: slopes of such pairs, not of
+neighbours, whose errors are alike."""
+LEAST_SPREAD = 0.25
+"""Difference of d within a pair, over the standard deviation of all, from which it has a slope."""
+MOST_ERROR = 0.1
+"""Standard error of the shift over the median of d - c beyond which it is not known: depths half as
+large and twice as large as the median's are then 5 and 20 % off."""
+INDEPENDENT = 48
+"""Errors of a network that count as independent in a picture (8 x 6 cells), as those of matches
+(tracking/pose/solver.py)."""
+RULES = Rules(iterations=12, sigmas=1e-2, damping=0.0)
+"""Of reweighting; each iteration divides the remaining error by five or more."""
+FARTHEST = 50.0
+"""Depth over the median depth beyond which nothing is known: there the shift decides all."""
+
+
+def shift_of(
+    inverse: Array,  # [M] the network's inverse depths, d
+    rho: Array,  # [M] the keyframe's
+) -> float | None:
+    """-c of d = g rho + c; None where d does not grow with rho, or the depths differ too little
+    for the shift to be known."""
+    slope = _slope_of_pairs(inverse, rho)
+    if slope is None or slope <= 0.0:
+        return None
+    start = 1.0 / slope
+    line = np.array([start, float(np.median(inverse - start * rho))])
+    A = np.stack([np.ones_like(rho), 1.0 / rho], -1)  # divided by rho: errors are relative
+    y = inverse / rho
+    problem = RobustFit(
+        residuals=lambda line: A @ line - y,
+        jacobian=lambda line: A,
+        kernel=Tukey(),
+        expected=line,
+        sigma=np.full(2, np.inf),
+        least_noise=1e-9 * start,
+    )
+    line = minimise(problem, line, RULES).state
+    share = min(INDEPENDENT / len(rho), 1.0)
+    error = float(np.sqrt(covariance_of(problem.linearise(line).H)[1, 1] / share))
+    level = line[0] * float(np.median(rho))
+    return float(-line[1]) if level > 0.0 and error < MOST_ERROR * level else None
+
+
+def shifted_depth(
+    z: Array,  # [H, W] of the network; NaN where unknown
+    shift: float,
+) -> Array:
+    """[H, W] 1 / (1 / z + shift); NaN where that is no depth or too far away to be known."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / z + shift
+        inverse = np.where(inverse > 0.0, inverse, np.nan)
+    if not np.isfinite(inverse).any():
+        return inverse
+    least = float(np.nanmedian(inverse)) / FARTHEST
+    return np.asarray(np.where(inverse > least, 1.0 / inverse, np.nan))
+
+
+def _slope_of_pairs(
+    x: Array,  # [M]
+    y: Array,  # [M]
+) -> float | None:
+    """Median slope (Theil and Sen) of pairs that differ; None where too few do."""
+    run, rise = (
+        np.concatenate([np.roll(values, len(values) // lag) - values for lag in LAGS])
+        for values in (x, y)
+    )
+    differ = np.abs(run) > LEAST_SPREAD * x.std()
+    if x.std() <= 1e-6 * np.abs(x).max() or differ.sum() < len(x) // 4:
+        return None
+    return float(np.median(rise[differ] / run[differ]))
+
+
+# --- ----------------------------------------------------------------------------------------------
+# What a prior knows of a keyframe's depths, kept with those that are triangulated.
+
+
+def add_learned(
+    pointmap: Pointmap,
+    X: Float | None,  # [H, W, 3] in the pointmap's camera; NaN where unknown
+    Q: Float | None,  # [H, W] 1 / relative variance; 0 where unknown
+    known_sigma: float,
+    config: LearnedConfig,
+    unit: RangeUnit = "shared",
+    before: Callable[[], Pointmap] | None = None,
+) -> LearnedDepth | None:
+    """Set what the prior knows of the picture in ``pointmap``, and return it; None, and no change,
+    without ranges or a unit for them.
+
+    The unit is that of the triangulated depths; where these are too few, because the camera only
+    turned, that of what ``before`` gives: what the keyframe before had learned, seen from here.
+
+    Both are kept, and no mean is taken of them: the network's error is that of a whole part of the
+    picture, so that depths which are better one by one would all be moved the same way.
+    """
+    if not config.depth or X is None or Q is None:
+        return None
+    depth = learned_depth(pointmap, X, Q, known_sigma, unit)
+    if depth is None and before is not None:
+        depth = learned_depth(before(), X, Q, known_sigma, unit)
+    if depth is not None:
+        pointmap.learned = depth.kept
+    return depth

@@ -20,10 +20,14 @@ from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
-from aquaflow.tracking.metric.sightings import LengthSightings
-from aquaflow.tracking.metric.straightening import estimates_of, straighten
-from aquaflow.tracking.metric.survey import TrackingSnapshot, sampled_points
-from aquaflow.tracking.metric.world_edges import World
+from aquaflow.tracking.metric.measured import World
+from aquaflow.tracking.metric.straightening import (
+    LengthSightings,
+    TrackingSnapshot,
+    estimates_of,
+    sampled_points,
+    straighten,
+)
 from aquaflow.types import TelemetrySample
 
 Array = npt.NDArray[np.float64]

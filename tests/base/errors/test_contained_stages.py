@@ -27,7 +27,7 @@ from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.current_keyframe import KeyframeTracker
-from aquaflow.tracking.gate.gate import FrameGate
+from aquaflow.tracking.gate import FrameGate
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.initialisation.initialiser import Initialiser
 from aquaflow.tracking.loops.relocaliser import Places

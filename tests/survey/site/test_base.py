@@ -12,7 +12,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.keyframes.places_file import NAME, PlacesFile
 from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.merging import merge
-from aquaflow.tracking.base.opening import base_of
+from aquaflow.tracking.base import base_of
 
 
 @pytest.fixture

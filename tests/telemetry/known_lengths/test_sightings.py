@@ -8,7 +8,7 @@ import pytest
 from aquaflow.config import FusionConfig, parse_config
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.metric.sightings import LengthSightings
+from aquaflow.tracking.metric.straightening import LengthSightings
 from tests.telemetry.known_lengths.boards_in_pictures import (
     CAMERA,
     METRES_PER_UNIT,

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch, so3_exp
-from aquaflow.tracking.adjustment.equations import AnchorMatches
+from aquaflow.tracking.adjustment.equations import AnchorMatches, Links
 from aquaflow.tracking.adjustment.joint import JointProblem
-from aquaflow.tracking.adjustment.links import Links
 
 Array = npt.NDArray[np.float64]
 

@@ -18,10 +18,9 @@ from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.frames import KeyframeEdge
-from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.graph.pose_graph import Edge
-from aquaflow.tracking.graph.table import Snapshot
+from aquaflow.tracking.graph.table import Improvement, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places
 from tests.tracking.tracking_scenes import CAMERA, Array, SeaFloor, lawn_path
 

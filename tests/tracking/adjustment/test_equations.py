@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
-from aquaflow.tracking.adjustment.block_matrix import BlockPattern
 from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
+    Links,
     anchor_equations,
     equations_and_scores,
     project,
 )
-from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import BundleState, cost_of, linearise
+from aquaflow.tracking.adjustment.solver import BlockPattern, BundleState, cost_of, linearise
 from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
 
 STEP = 1e-6

@@ -14,9 +14,8 @@ from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     anchor_equations,
 )
-from aquaflow.tracking.adjustment.held_out import triangulate, verdict
-from aquaflow.tracking.adjustment.joint import adjust
-from aquaflow.tracking.adjustment.uncertainty import covariance
+from aquaflow.tracking.adjustment.joint import adjust, triangulate, verdict
+from aquaflow.tracking.adjustment.solver import covariance
 from tests.tracking.adjustment.adjustment_scenes import NOISE, Array, apart, scene, shaken
 
 

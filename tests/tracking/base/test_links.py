@@ -16,9 +16,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
-from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.in_base import InBase
-from aquaflow.tracking.base.links import BaseLink, agree, fit_sub_map, link_covariance
+from aquaflow.tracking.base import Base, BaseLink, InBase, agree, fit_sub_map, link_covariance
 from tests.tracking.tracking_scenes import KnownView
 
 CAMERA = CameraModel(4, 3, 4.0, 4.0, 2.0, 1.5)

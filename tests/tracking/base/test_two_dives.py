@@ -11,7 +11,7 @@ import pytest
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.slam import Slam
-from aquaflow.tracking.base.opening import open_base
+from aquaflow.tracking.base import open_base
 from tests.tracking.base.two_dives import (
     TRACKED_ONLY,
     first_way,

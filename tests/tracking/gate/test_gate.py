@@ -10,8 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.config import GateConfig
-from aquaflow.tracking.gate.gate import FrameGate, GateKind, GateVerdict
-from aquaflow.tracking.gate.thumbnail import TILES, _tile_means
+from aquaflow.tracking.gate import TILES, FrameGate, GateKind, GateVerdict, _tile_means
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path, pose
 
 Picture = npt.NDArray[np.uint8]

@@ -13,8 +13,7 @@ from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.tracking.initialisation import initialiser as initialiser_module
-from aquaflow.tracking.initialisation.hypotheses import Hypotheses
-from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrate
+from aquaflow.tracking.initialisation.initialiser import Hypotheses, Initialiser, calibrate
 from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, depth_map, pose
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)

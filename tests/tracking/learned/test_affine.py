@@ -8,8 +8,13 @@ import pytest
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import RangeUnit
-from aquaflow.tracking.learned.affine import FARTHEST, shift_of, shifted_depth
-from aquaflow.tracking.learned.scaling import LearnedDepth, learned_depth
+from aquaflow.tracking.learned.scaling import (
+    FARTHEST,
+    LearnedDepth,
+    learned_depth,
+    shift_of,
+    shifted_depth,
+)
 from aquaflow.tracking.pose.matcher import own_points
 from tests.tracking.learned.learned_scenes import KNOWN_SIGMA, TRUTH, affine_network, measured
 from tests.tracking.tracking_scenes import CAMERA, Array, KnownPair, KnownView

@@ -8,7 +8,7 @@ import pytest
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, LearnedDepths, Pointmap
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
-from aquaflow.tracking.metric.learned_scales import (
+from aquaflow.tracking.metric.straightening import (
     EVERY,
     LEAST_KEYFRAMES,
     LearnedScales,

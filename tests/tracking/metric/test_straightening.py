@@ -10,8 +10,8 @@ from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 from aquaflow.tracking.graph.table import GraphResult
+from aquaflow.tracking.metric.measured import KeyframeMeasurements, World, WorldEdge, world_edge
 from aquaflow.tracking.metric.straightening import solve_with_worlds
-from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, World, WorldEdge, world_edge
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, Dive
 
 Array = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.frame_table import FRAME, NONE
 from aquaflow.tracking.graph.table import NODE
-from aquaflow.tracking.metric.survey import MOST_POINTS, TrackingSnapshot
+from aquaflow.tracking.metric.straightening import MOST_POINTS, TrackingSnapshot
 
 Array = npt.NDArray[np.float64]
 

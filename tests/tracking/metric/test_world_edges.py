@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, World, WorldEdge, world_edge
+from aquaflow.tracking.metric.measured import KeyframeMeasurements, World, WorldEdge, world_edge
 from tests.metric_scenes import metric_frame
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.lab.synthetic.display import burn_in
-from aquaflow.tracking.overlay.finder import OverlayFinder
+from aquaflow.tracking.overlay import OverlayFinder
 from aquaflow.types import Frame
 
 WIDTH, HEIGHT = 480, 360

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.pose.expected_matches import WIDE_WIDTHS, expected_matches, is_wide
+from aquaflow.tracking.pose.matcher import WIDE_WIDTHS, expected_matches, is_wide
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
 

@@ -10,9 +10,8 @@ import pytest
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.library import load_library
 from aquaflow.tracking.pose import solver
-from aquaflow.tracking.pose.pixel_equations import PixelEquations
 from aquaflow.tracking.pose.residuals import Matches, PoseProblem
-from aquaflow.tracking.pose.solver import KERNEL, RowEquations, solve_pose
+from aquaflow.tracking.pose.solver import KERNEL, PixelEquations, RowEquations, solve_pose
 from tests.tracking.tracking_scenes import cloud, pose, problem_of
 
 TRUTH = pose((0.05, -0.08, 0.1), (-0.15, 0.06, 0.1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import so3_log
-from aquaflow.tracking.pose.pnp import MIN_INLIERS, pose_from_scratch
+from aquaflow.tracking.pose.matcher import MIN_INLIERS, pose_from_scratch
 from tests.tracking.tracking_scenes import cloud, pose, problem_of
 
 FAR = pose((0.3, -0.4, 1.0), (-0.5, 0.3, 0.2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from aquaflow.tracking.pose.rigidity import rigid_share
+from aquaflow.tracking.consistency import rigid_share
 from tests.tracking.tracked_clips import SMALL, plane_depth
 from tests.tracking.tracking_scenes import KnownPair, KnownView, pose
 

@@ -10,9 +10,13 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.tracking.pose import solver
-from aquaflow.tracking.pose.covariance import UNKNOWN_SIGMA, pose_covariance
-from aquaflow.tracking.pose.pixel_equations import PixelEquations
-from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
+from aquaflow.tracking.pose.solver import (
+    UNKNOWN_SIGMA,
+    PixelEquations,
+    PoseProblem,
+    pose_covariance,
+    solve_pose,
+)
 from tests.tracking.tracking_scenes import CAMERA, cloud, pose, problem_of
 
 Array = npt.NDArray[np.float64]

@@ -8,9 +8,8 @@ import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.pose.problem import pose_problem
+from aquaflow.tracking.pose.matcher import pose_problem, surroundings
 from aquaflow.tracking.pose.solver import solve_pose
-from aquaflow.tracking.pose.surroundings import surroundings
 from tests.tracking.tracking_scenes import CAMERA, Array, depth_map, pose
 
 FORWARD = pose((0.002, -0.001, 0.001), (0.004, 0.008, -0.06))

@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.pose.turning_step import turning_step
+from aquaflow.tracking.wide_steps import turning_step
 from tests.tracking.tracking_scenes import CAMERA, KnownPair, KnownView, SeaFloor, pose
 
 STEP = pose((0.02, 0.2, 0.01), (0.3, 0.02, 0.05))

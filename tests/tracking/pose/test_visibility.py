@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.pose.visibility import agreeing, is_expected, predicted_matches, visibility
+from aquaflow.tracking.pose.matcher import agreeing, is_expected, predicted_matches, visibility
 from tests.tracking.tracking_scenes import CAMERA, pose
 
 DEPTH = 2.0

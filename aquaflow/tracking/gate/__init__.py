@@ -1,1 +1,0 @@
-"""The frame gate: frames that cannot help are skipped before costly work."""

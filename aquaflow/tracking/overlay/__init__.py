@@ -1,1 +1,0 @@
-"""Burned-in overlays (clock, crosshair, logo): found by themselves and masked."""
