@@ -104,7 +104,7 @@ class Worker:
         self._asked.clear()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How many threads may work: one for each core, however many are asked for.
 #
 # More only wait for each other, and thousands of them stop the machine.
@@ -126,7 +126,7 @@ def usable_threads(asked: int | None) -> int:
     return cores
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Clean end of a long run on SIGINT (Ctrl-C) or SIGTERM (systemd).
 
 ASKED = (signal.SIGINT, signal.SIGTERM)

@@ -182,7 +182,7 @@ def write_board(board: Board, path: Path) -> None:
         raise InputError(f"cannot write {path}: {reason_of(error)}") from error
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The pictures that a calibration is made from: those that show the board, each unlike the rest.
 
 LEAST_CORNERS = 8

@@ -286,7 +286,7 @@ def _sigma(
     return np.asarray(np.sqrt(np.maximum(noise, scatter)))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a calibration estimates, as a vector: the lens, or the place of a flat port before it.
 
 LENS = {

@@ -131,7 +131,7 @@ def _as_yaml(config: dict[str, Any]) -> str:
     return str(yaml.safe_dump(config, sort_keys=False)).rstrip()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The command that says what would be read of a recording: ``inspect``.
 
 MOST_FRAMES = 30

@@ -165,7 +165,7 @@ def _print(results: list[Result], console: Console) -> None:
         console.print(f"  reproduce with: {result.command}", markup=False)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The command that maps many recordings: ``lab batch``.
 
 POOR_RESULT = 3

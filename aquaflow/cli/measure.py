@@ -197,7 +197,7 @@ def _in_words(found: Any, unit: LengthUnit) -> str:
     return "\n".join([*lines, *said])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The command that gives a finished dive its metres by a marked length: ``measure scale``.
 
 RESCALED = (

@@ -234,7 +234,7 @@ def train_compact(
         typer.echo(f"written to {out / PRIOR}: {json.dumps(record['held_out'])}")
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The command that makes a prior of the user's own depth network. Thin, like all of cli/.
 
 DEFAULT_WIDTH, DEFAULT_HEIGHT = 518, 392
@@ -322,7 +322,7 @@ def _three(text: str, option: str) -> tuple[float, ...]:
     return numbers
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The command that checks a prior's files, here and where they are to run. Thin, as all of cli/.
 
 MOST_RELATIVE = 1e-4

@@ -146,7 +146,7 @@ CameraConfig: TypeAlias = Annotated[
 ]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of a source: which frames, and how they are prepared.
 
 
@@ -171,7 +171,7 @@ class SourceConfig(StageConfig):
     fps: float | None = Field(None, gt=0, description="frames/s of a folder without timestamps")
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of the small pictures that a dive keeps of what its camera saw.
 
 

@@ -220,7 +220,7 @@ class ServiceConfig(StageConfig):
     report: VehicleReportConfig = VehicleReportConfig()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of the recorder: how pictures are kept, and how files are cut.
 
 
@@ -254,7 +254,7 @@ class RecordingConfig(StageConfig):
     )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of the window into a dive.
 
 
@@ -271,7 +271,7 @@ class ViewerConfig(ListenConfig):
     pose_hz: Lab[float] = Field(4.0, gt=0, le=30, description="frustum and trajectory")
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of the coverage: what counts as seen, and how survey lines shall overlap.
 
 

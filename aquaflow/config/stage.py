@@ -83,7 +83,7 @@ def without_the_lab(model: type[StageConfig], values: Mapping[str, Any]) -> dict
     return shown
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What became of keys that a config had in earlier releases; understood for one release.
 
 log = logging.getLogger(__name__)
@@ -170,7 +170,7 @@ def _taken_out(data: dict[str, Any], paths: Mapping[str, Any]) -> Iterator[tuple
             yield path, below.pop(key)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings that every telemetry device has, and where it is mounted.
 
 

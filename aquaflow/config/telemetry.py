@@ -214,10 +214,10 @@ def parse_telemetry(data: dict[str, Any], origin: str) -> TelemetryConfig:
     return validate(TelemetryConfig, data, origin)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of the fusion of telemetry with the camera.
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Settings of objects of known size that give the map its scale.
 
 Dictionary: TypeAlias = Literal[

@@ -190,7 +190,7 @@ def _nearness(keyframe: Keyframe) -> float:
     return float(np.median(known)) / keyframe.T_wc.scale if len(known) else 0.0
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The camera of a dive without calibration, as its own pictures show it.
 
 log = logging.getLogger(__name__)
@@ -289,7 +289,7 @@ def usable(camera: CameraModel) -> CameraModel | None:
     return camera
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What the calibration check found, for metrics.json and in words.
 
 REMEDY = (

@@ -326,7 +326,7 @@ def _edges(graph: Snapshot) -> Rows:
     return rows
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What is made of a dive beside the files of the core: reports, plan views, numbers of the ground.
 #
 # Each is found by an entry point of ``GROUP``; so a site can have its own (docs/extending.md).
@@ -387,7 +387,7 @@ def deliverables_of(slam: Slam) -> dict[str, Deliverable]:
     return dict(sorted(found.items(), key=lambda each: (each[1].phase, each[0])))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The frames of a finished dive with what is known of each: class, pose, time, navigation.
 
 NS = 1_000_000_000

@@ -147,7 +147,7 @@ def _world_in_words(frame: WorldFrame) -> str:
     return f"{axes}; unit: {frame.unit}"
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The rows of trajectory.csv: each pose with what telemetry and the metric frame say of it.
 
 Array = npt.NDArray[np.float64]

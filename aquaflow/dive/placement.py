@@ -91,7 +91,7 @@ def placement(frame: WorldFrame) -> Placement:
     return Placement(T_un, frame.unit, axes, grid_of(frame))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The UTM grid that what a dive exports is laid on, where the dive's place on the earth is known.
 #
 # Points of n are in metres north, east and down of the dive's origin (georeference.py). The zone is
@@ -174,7 +174,7 @@ def grid_of(frame: WorldFrame) -> UtmGrid | None:
     return UtmGrid.of(frame.origin)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Where on the earth a dive was: latitude and longitude of points of n, and ``georeference.json``.
 #
 # n is the plane that touches the WGS 84 ellipsoid at the origin, x to true north, z down. The water
@@ -244,7 +244,7 @@ def _utm(origin: Origin) -> dict[str, Any] | None:
     }
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The plane of a plan view: what points to the right and up on the page.
 
 LEVEL = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -282,7 +282,7 @@ def names_of(frame: WorldFrame, axes: Array) -> tuple[str, str, str]:  # [2, 3] 
     return "from above", "east" if north.endswith("north") else f"right of the {north}", north
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # ``in_site.json``: where a dive lies in an earlier one, and what speaks for it; also in words.
 
 FORMAT = 1

@@ -137,7 +137,7 @@ def read_splats(dive: Dive, placement: Placement, water: bool) -> PlyGaussians:
     return splats.transform(placement.T_un)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The views of a dive's map with their cameras and poses in the upright frame.
 
 

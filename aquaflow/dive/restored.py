@@ -144,7 +144,7 @@ def _with_picture(
     return whole
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The recording's pictures of a dive's views, prepared as they were mapped.
 
 
@@ -205,7 +205,7 @@ def _check_size(
         )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Pictures with their poses and the map's points, as programs that build maps take them in.
 
 Pictures = Iterator[tuple[int, npt.NDArray[np.uint8]]]

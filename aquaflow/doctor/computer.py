@@ -128,7 +128,7 @@ def disk(machine: MachineProbes) -> CheckResult:
     )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Optional packages: which version is installed, what it is for, and what installs it.
 #
 # Nothing is imported: some of them take seconds, and one prints.

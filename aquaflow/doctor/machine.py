@@ -128,7 +128,7 @@ class MachineProbes:
         return [path for pattern in patterns for path in sorted(self.root.glob(pattern))]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a GPU is used for: what was tried on it and came out right, not what is installed.
 
 CUDA, TENSORRT = "CUDAExecutionProvider", "TensorrtExecutionProvider"

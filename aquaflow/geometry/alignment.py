@@ -112,7 +112,7 @@ def _on_a_line(
     return bool(spread[1] <= LINE_SPREAD * spread[0])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Positions on the earth in the plane that touches the WGS 84 ellipsoid at an origin.
 
 Array = npt.NDArray[np.float64]

@@ -269,7 +269,7 @@ def _what_is_wrong(error: ValidationError) -> str:
     return f"{named}{words_of(first['msg'])}; known keys are {', '.join(fields)}"
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A camera's calibration as a file that :func:`aquaflow.geometry.camera.load_camera` reads.
 
 
@@ -331,7 +331,7 @@ def save_for_others(camera: CameraModel, folder: Path) -> list[Path]:
     return [ros, opencv]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Values of a field at pixel positions (docs/conventions.md: a pixel's centre is at + 0.5).
 
 Scalar = TypeVar("Scalar", bound=np.generic)

@@ -82,7 +82,7 @@ def _parallax(
     return origins[:, :2] - origins[:, 2:] * slopes, axis[:2] - axis[2] * slopes
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Lens distortion by OpenCV's models: distorted pixels of rays, and rays of distorted pixels.
 
 NEWTON_ITERATIONS = 50
@@ -168,7 +168,7 @@ def _unfold(
     return unfolded
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Rays through a port: from the lens through glass into the water, and back from a point.
 #
 # Both kinds of port are axial: every ray in the water meets the line through the centre of
@@ -317,7 +317,7 @@ def _to_sphere(
     return np.asarray(start + rays * (np.sqrt(middle**2 - outside) - middle))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a calibration may have left of a lens in pictures that it undistorted.
 #
 # A ray through (x, y, 1) is seen at ``exp(u) (1 + k r^2 + l r^4) (x, y) + (x0, y0)`` of the

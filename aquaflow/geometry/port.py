@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, model_validator
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The refractive index of water, relative to the air inside a housing.
 
 GREEN_NM = 550.0
@@ -129,7 +129,7 @@ class DomePort:
 Port: TypeAlias = FlatPort | DomePort
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The key ``port`` of ``camera.yaml``: a flat port or a dome with its measures.
 
 GLASSES = {"acrylic": ACRYLIC, "glass": 1.52, "polycarbonate": 1.59, "sapphire": 1.77}

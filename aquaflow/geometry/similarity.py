@@ -195,7 +195,7 @@ def _left_jacobian(
     return float(np.sum(growth)) * np.eye(3) + first * W + second * (W @ W)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Many similarities at once: Sim(3) of ``similarity.py`` over the first axis of arrays.
 #
 # Conventions are those of ``Sim3``: tangents are [translation, rotation, log-scale].

@@ -123,7 +123,7 @@ def _homography_poses(
     return poses
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How far matches lie from each other's epipolar lines under a relative pose.
 
 LEAST_GRADIENT = 1e-12
@@ -150,7 +150,7 @@ def epipolar_distances(
     return np.asarray(np.abs(constraint) / np.maximum(gradient, LEAST_GRADIENT))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Depth of matched pixels from two known views, with the uncertainty that the parallax allows.
 
 MIN_PARALLAX_RAD = np.radians(0.15)

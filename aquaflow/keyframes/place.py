@@ -154,7 +154,7 @@ def _descriptors(
     return np.asarray((both * np.float32(LARGEST_ROOT / LEVELS)) ** 2, dtype=np.float32)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Inverse depths of a keyframe's pixels: triangulated, and what a prior knows of them.
 
 Mask = npt.NDArray[np.bool_]

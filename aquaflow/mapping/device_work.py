@@ -25,7 +25,7 @@ from aquaflow.render import cpu_renderer
 from aquaflow.render.contract import Renderer
 from aquaflow.render.gsplat import give_back_after
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A map whose device failed goes on on the CPU.
 #
 # A device that is out of memory can still be read, and the map goes on as it is. One that is gone

@@ -139,7 +139,7 @@ def raw_colour(
     return y + torch.log(-torch.expm1(-COLOUR_SHARPNESS * y)) / COLOUR_SHARPNESS
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Medium-guided insertion: where new Gaussians go, and how they start (paper, Eq. 16 and 17).
 
 LOG_GAIN = 3.0
@@ -325,7 +325,7 @@ def new_gaussians(
     return new if bool(sound.all()) else {name: values[sound] for name, values in new.items()}
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The map follows its keyframes: Gaussians and views move by the full similarity.
 
 

@@ -133,7 +133,7 @@ def to_bytes(
     return np.asarray(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The map's own colours without water, bounded as those of restored pictures are.
 #
 # The map's radiance J was found behind its water so that pictures fit; where little light came back

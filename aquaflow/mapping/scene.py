@@ -275,7 +275,7 @@ def orientations(views: Sequence[View], device: torch.device) -> Tensor:
     return pose_in(rotations, device)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # One picture of the map: clean radiance and range from the renderer, then the water.
 
 

@@ -152,7 +152,7 @@ def _water_of(
     return replace(water, beta_a=water.beta_a[which])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # When the water is fitted, and that no frame waits for it: a few steps with each new view.
 
 log = logging.getLogger(__name__)

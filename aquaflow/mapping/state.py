@@ -264,7 +264,7 @@ def _under(prefix: str, arrays: Mapping[str, Any], device: torch.device) -> dict
     return {name: checkpoint_in(array, device) for name, array in under(prefix, arrays).items()}
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A copy of what is shown of a map, which goes on being mapped meanwhile.
 
 

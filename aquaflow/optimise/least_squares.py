@@ -16,8 +16,8 @@ radians and log-scales go together; without damping the step is Gauss-Newton's. 
 measures (a gauge: position, attitude and scale of a whole map) stays where it is. H at the end is
 the information of x, and its inverse the covariance.
 
-What keeps a loop of its own says why at its top: ``tracking/graph/optimisation.py`` (unknowns that grow
-on the way), ``mapping/optimisation/registration.py`` (derivatives that are drawn),
+What keeps a loop of its own says why at its top: ``tracking/graph/optimisation.py`` (unknowns that
+grow on the way), ``mapping/optimisation/registration.py`` (derivatives that are drawn),
 ``survey/change/registration.py`` (pairs that change), ``tracking/learned/scaling.py`` (noise of two
 parts).
 """

@@ -215,7 +215,7 @@ def _positive(
     return np.asarray(np.where(sound, (values - least) / (high - low) + FARTHEST, np.nan))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How a picture becomes a network's input of another size, and what of the output shows it.
 
 Picture = npt.NDArray[np.uint8]

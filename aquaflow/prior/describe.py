@@ -151,7 +151,7 @@ def _try_prior(folder: Path, card: PriorCard) -> Described:
     return Described(card, width, height, seconds, known)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Does a prior say the same on another processor, or in less precision, as on the CPU in 32 bits?
 #
 # What is compared is what tracking gets: features of two fixed pictures, and descriptors, ranges
@@ -238,7 +238,7 @@ def _scale(output: str) -> float | None:
     return 1.0 if output.startswith("log_") else None
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A picture that networks are tried on: always the same, and with structure of all sizes.
 
 OCTAVES = (4, 8, 16, 32, 64)

@@ -256,7 +256,7 @@ class FlowMatcher:
         return np.asarray(self._seeded.calc(a, b, initial), dtype=np.float32)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The flow from b to a, once that from a to b is known: reversed, then fitted to the pictures.
 #
 # Fitting from coarse to fine takes half the time of a second DIS flow. A match that was wrong is
@@ -302,7 +302,7 @@ def backward_flow(
     return flow
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Sub-pixel refinement of a dense flow: one symmetric Gauss-Newton step at full resolution.
 #
 # DIS stops at half the resolution: its matches err by 0.3 px, and neighbouring matches err
@@ -438,7 +438,7 @@ def _gradient(
     return np.asarray(along_x, dtype=np.float32), np.asarray(along_y, dtype=np.float32)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Fields over a picture: pixel centres, and values between them.
 
 

@@ -111,7 +111,7 @@ class FlowPair:
         return None
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Several flows to start from, one after the other, until one explains the pair.
 #
 # DIS follows displacements up to some 15 % of the picture's width; what is larger must be known

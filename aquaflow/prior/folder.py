@@ -12,7 +12,7 @@ from aquaflow.base.errors import InputError, path_of_key
 from aquaflow.config.stage import StageConfig
 from aquaflow.prior.contract import RangeUnit
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a monocular depth network takes and gives, as the card of its folder states it.
 
 Measure = Literal["depth", "inverse_depth", "log_depth"]

@@ -202,7 +202,7 @@ def _starts(
     yield None
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Where a picture went, coarsely: mutual nearest neighbours among descriptors of its cells.
 #
 # Every cell votes alone, so many are wrong; those that follow the motion of most, or that of many

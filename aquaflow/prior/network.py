@@ -90,7 +90,7 @@ def unit(
     return np.asarray(descriptors / np.maximum(length, SHORTEST), dtype=np.float32)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Ranges that a network gives without parallax, as the contract's pointmap X and confidence Q.
 
 LEAST_VARIANCE = 1e-4

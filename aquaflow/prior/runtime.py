@@ -260,7 +260,7 @@ def _engine_folder(asked: Path | None) -> Path | None:
     return folder
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The encoder with 8-bit weights and activations (QDQ, per channel), calibrated on pictures.
 
 INT8_ENCODER = "encoder_int8.onnx"

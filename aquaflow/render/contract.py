@@ -173,7 +173,7 @@ def check_devices(
             )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The activity mask: which tiles of a picture are drawn, over pixels and over footprints.
 
 
@@ -230,7 +230,7 @@ def touches_active(
     return table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What is drawn of the Gaussians' raw parameters, fused with its gradient.
 #
 # Scales are exponentials and opacities logistic functions; the radiance J is a softplus, positive

@@ -161,7 +161,7 @@ class _Rasterise(torch.autograd.Function):
         return (*gradients, *[None] * 6)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The fallback renderer: torch only, batches of tiles, for machines without a compiler.
 #
 # Correct and slow: every Gaussian of a tile is evaluated at every pixel of it.

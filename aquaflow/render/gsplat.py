@@ -174,7 +174,7 @@ def _sound(
         return finite & positive & (quats.square().sum(1) > 0)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The GPU that torch sees, by its name, or why torch sees none.
 
 
@@ -221,7 +221,7 @@ def gpu_here() -> Gpu | str:
     )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The memory of the device that a map lives on: how much is left, and giving back what is idle.
 #
 # torch keeps blocks that no tensor uses any more, and the driver counts them as taken; the next

@@ -14,7 +14,7 @@ from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.library import Library, library_or_none
 from aquaflow.render.tensor_address import pointer
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A scalar whose gradient is computed with it, as fused kernels do.
 
 
@@ -164,7 +164,7 @@ class _Photometric(KnownGradient):
         return loss[0]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What the loss of a view has beside the pictures' likeness: outliers, and the prior's ranges.
 #
 # Each has its definition in torch, which is the oracle of the kernel and what other devices use.

@@ -236,7 +236,7 @@ class ReferenceRenderer:
         return Rendering(image, weights.sum(0).view(height, width), visible, radius_px)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How far a renderer's picture and gradients are from the float64 reference's.
 
 PICTURE = "picture"

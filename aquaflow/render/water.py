@@ -111,7 +111,7 @@ class _ComposeWater(torch.autograd.Function):
         return (*gradients, None, None, None, None)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The sinusoidal encoding gamma of the paper (Eq. 7).
 
 BANDS = 4

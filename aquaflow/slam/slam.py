@@ -380,7 +380,7 @@ class Slam:
         ]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How long the end of a dive may take, and until when each of its phases may go on.
 #
 # A supervisor that waits for a stopped service kills it after a while, so that the end of a dive is

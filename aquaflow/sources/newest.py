@@ -86,7 +86,7 @@ class Newest(Generic[Item]):
             self._discard(items.popleft())
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Reads a recording past frames on which its reader raises; only these frames are lost.
 
 Event = TypeVar("Event", bound=Frame | Dropped | TelemetrySample)
@@ -135,7 +135,7 @@ def read_past_failures(
     give_up(start)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The computer's own clock as a source of UTC, so that a recording holds what a live dive heard.
 
 SOURCE = "computer/clock"
@@ -169,7 +169,7 @@ class WallClock:
         self._closed.set()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The telemetry that a replay is given: what is on the recording's clock, and what is not yet.
 
 

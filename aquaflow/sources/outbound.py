@@ -90,7 +90,7 @@ class AcceptsMessages(Protocol):
         ...
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a vehicle's pilot does, as far as its devices tell: arming, and commands to AquaFlow.
 
 PilotRequest: TypeAlias = Literal["start", "stop", "finish", "new"]

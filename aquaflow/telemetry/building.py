@@ -240,7 +240,7 @@ def _by_model(latitude_deg: float, longitude_deg: float, date: datetime) -> floa
     return None if field.in_blackout_zone else float(np.radians(field.d))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How the body and the map are turned: the problem with factors of where down and north are.
 
 SCALE_SIGMA = 3.0
@@ -359,7 +359,7 @@ def _add_directions_of_fixes(
         problem.factors.append(ConstantDepthFactor(path, depth_change_sigma_m))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Which samples the estimator can use of a dive's telemetry, and why not the others.
 
 LEAST_SAMPLES = 5

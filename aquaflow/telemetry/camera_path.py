@@ -69,7 +69,7 @@ class CameraPath:
         return columns_at(t_s, self.t_s, slope)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What telemetry measured, looked up at the moments of frames.
 
 LONGEST_INTERPOLATED_S = 2.0

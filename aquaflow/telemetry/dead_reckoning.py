@@ -93,7 +93,7 @@ def _reckon(telemetry: Telemetry, heading: float, first_s: float, last_s: float)
     return Reckoned(moved, covariance + (0.003 * float(np.linalg.norm(moved))) ** 2 * np.eye(2))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How the body moved between two frames, by gyro and DVL: what tracking expects of the next one.
 
 KEPT_S = 5.0

@@ -117,7 +117,7 @@ def estimate(
     return Estimate(clocks.with_clocks(frame), problem, solution)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # From the estimator's solution to what leaves: the frame, its covariance, and the reports.
 
 ZERO_DEPTH_SIGMA_M = 0.1
@@ -226,7 +226,7 @@ def _alone(problem: TelemetryProblem, solution: Solution, factor: Factor) -> flo
     return float(np.sqrt(covariance_of(A)[0, 0]))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Whether the scale holds in every part of a path, where no rotation shows that clocks agree.
 #
 # Samples that are out of step with the pictures give a scale too, and residuals that look like

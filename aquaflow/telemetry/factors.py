@@ -86,7 +86,7 @@ def axes_along(
     return np.stack([along, first, np.cross(along, first)], axis=1)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # An altimeter: its range against the map's own range along its beam.
 
 MOST_BEAMS = 100
@@ -203,7 +203,7 @@ def _within(
     return points[inside], ranges[inside]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Attitude: where down is in the body, and where it points; else specific force for down.
 
 TILT_SIGMA = np.radians(0.5)
@@ -303,7 +303,7 @@ class HeadingFactor(Factor):
         return np.asarray(np.arctan2(np.sin(apart), np.cos(apart)))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # No source: the vehicle is taken to keep its depth, where nothing else says what is down.
 
 
@@ -327,7 +327,7 @@ class ConstantDepthFactor(Factor):
         return np.asarray(p_n[:, 2:] - p_n[:, 2:].mean())
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Pressure: how far the body lies below the surface, so metres along gravity.
 
 DEPTH_SIGMA_M = 0.01
@@ -363,7 +363,7 @@ class DepthFactor(Factor):
         return np.asarray(p_n[:, 2:] - self._depth_m[:, None])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Lengths that somebody knows: the side of a marker, two laser dots, a scale bar.
 
 APART_S, LASTING_S = 100.0, 1e9
@@ -413,7 +413,7 @@ def length_factors(lengths: Sequence[KnownLength]) -> list[LengthFactor]:
     ]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Fixes on the earth: GNSS at the surface, USBL or another acoustic system below.
 
 
@@ -455,7 +455,7 @@ class PlaceFactor(PositionFactor):
     """m: all of its uncertainty is in its sigma."""
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A DVL: displacements over ground, which are metres whatever the vehicle does.
 
 INTERVAL_S = 1.0

@@ -238,7 +238,7 @@ def _gate(
     return np.asarray(apart <= GATE * spread)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What the estimator solves: sources as factors, where to start, what is known before.
 
 OPEN_M, FIXED = 1e4, 1e-3

@@ -166,7 +166,7 @@ def level_fit(
     return T.scale, heading_of(T.R)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How wrong a source's residuals are: white noise, and parts that last.
 #
 # What limits telemetry is seldom its white noise: waves, the drift of an attitude filter, the drift

@@ -32,7 +32,7 @@ from aquaflow.telemetry.turns import (
 )
 from aquaflow.types import TelemetrySample
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The offset to a fraction of a frame, with its covariance: a robust fit of one model.
 #
 # The camera's turn over each frame interval is the body's over the same interval, turned into

@@ -167,7 +167,7 @@ def _in_order(source: str, samples: Sequence[AngularRate | Attitude]) -> Series:
     return Series(source, times[order], values[order])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Every offset between two series of turns at once: how much of one the other explains.
 #
 # For each offset the rotation between the two sets of axes is the best one for that offset (Wahba's

@@ -315,7 +315,7 @@ class KnownPlaces:
         return None
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Recognitions as measurements: do two of them agree, and where do they put the dive?
 #
 # Each says where one keyframe lies in the base, as a Sim(3) with its information. A single one may
@@ -455,7 +455,7 @@ class _Placement:
         return (Sim3Batch.exp(step[None]) @ T_sm).on_group()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # An earlier dive as another one sees it: keyframes without pictures, read and never changed.
 
 
@@ -494,7 +494,7 @@ class Base:
             )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Opens an earlier dive, or several in one frame, as the base of another dive.
 
 METRICS = "metrics.json"

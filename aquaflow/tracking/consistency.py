@@ -249,7 +249,7 @@ def _is_off(ratio: DepthRatio, most: float, sigmas: float) -> bool:
     return abs(ratio.log) > max(most, sigmas * ratio.sigma)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Do two pointmaps agree about how far the scene is? Points of one, looked up in the other.
 
 Array = npt.NDArray[np.float64]
@@ -296,7 +296,7 @@ def depth_ratio(
     return DepthRatio(middle, MEDIAN * spread / float(np.sqrt(count)), count)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Are the matches of a frame those of one rigid scene, whatever the keyframe's depths say? What
 # floats in front of the scene moves as it likes; wrong depths leave the matches as they are.
 

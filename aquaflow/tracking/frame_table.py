@@ -108,7 +108,7 @@ class FrameTable:
         return Tracked(frame, kind, sub_map, number, quality=quality), to_sim3(row["T_kf"])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Poses relative to keyframes: a frame moves with its keyframe in every later correction.
 
 

@@ -143,7 +143,7 @@ class FrameGate:
         return GateVerdict(GateKind.DUPLICATE, reason, motion)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Measures of a small grey thumbnail: texture above the noise, sharpness, motion.
 #
 # Measured in tiles, so that one fish or one lamp does not decide for the whole picture, and at one

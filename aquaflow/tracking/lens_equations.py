@@ -280,7 +280,7 @@ def _apply(
     return np.asarray(np.einsum("mij,mj->mi", R, vectors))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Self-calibrating bundle adjustment: poses, inverse depths, and one error of the lens for all.
 #
 # Every point belongs to the view that it was sampled in, so that the points' block of the normal
@@ -396,7 +396,7 @@ def _sigma(
     return max(sigma_of_lengths(size), MIN_SIGMA)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Keypoint matches between pictures as observations of points, for an adjustment of the lens.
 
 MATCHES_PER_PAIR = 200

@@ -105,7 +105,7 @@ class OverlayFinder:
         self._shown = np.asarray(full == 0) if share > 0.0 else None
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # From gradients that stay to the regions of an overlay: text blocks, crosshairs, logos.
 
 Mask = npt.NDArray[np.bool_]
@@ -259,7 +259,7 @@ def _reach(
     return reach
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Running statistics of a picture's gradients: which of them stay while the scene moves.
 
 Float = npt.NDArray[np.float32]

@@ -117,7 +117,7 @@ def doubt(pointmap: Pointmap) -> None:
     pointmap.fused = 0
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Two keyframes joined by a frame that was matched to both: an edge for the keyframe graph.
 
 RATIO_POINTS = 500

@@ -125,7 +125,7 @@ def _found_lens_of(
     return FoundLens(state.lens, sigma, simple.sigma, views, matches)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Which pictures of a dive show its lens: a bounded number, evenly spread over the motion.
 
 MOST_VIEWS = 32

@@ -206,7 +206,7 @@ def keypoint_poses(
     return poses
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A step into a part of the scene whose depth the keyframe does not know yet.
 #
 # A camera that turns by half its view between two pictures shows, in the second one, what the first

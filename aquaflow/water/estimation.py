@@ -182,7 +182,7 @@ def _beta_a_sigma(fit: WaterFit) -> list[float]:
     return list(np.sqrt(variance).tolist())
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Clear water, or air: its odds against water that dims and veils what is far.
 #
 # Contrast is never quite the same from near and from far, as ranges and poses are not exact; scenes
@@ -239,7 +239,7 @@ def _log_normal(
     return float(-0.5 * (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance)[1]))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Which of shading, exposure and unevenness there are: the likeliest model with and without water.
 #
 # Only the richest models are fitted from the start. What a smaller one's marginal likelihood is

@@ -110,7 +110,7 @@ def _between(
     return np.array([np.interp(frame_index, at, values[:, c]) for c in range(3)])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # White balance and amplification of a scene without its water.
 #
 # The clean radiance J is the scene as it would look through no water at all. Nobody has seen it so:

@@ -194,7 +194,7 @@ def _gain(
     return np.asarray(np.exp(np.clip(log_gain, -MAX_LOG_GAIN, MAX_LOG_GAIN)))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Weak priors on the colours of surface points without water.
 
 DARK_SHARE, DARK_LEVEL, DARK_SIGMA = 0.02, 0.02, 0.2

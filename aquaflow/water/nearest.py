@@ -109,7 +109,7 @@ def kept_by(
     return red, green, blue
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Open water in the pictures as observations: what backscatter looks like at infinity.
 
 COLUMNS, ROWS = 8, 6
@@ -191,7 +191,7 @@ def _is_even(
     return bool(residuals.std() < MOST_UNEVEN * values.mean())
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Open water in a picture: nothing but backscatter, which ends nowhere.
 #
 # It has no texture, and the colour of water seen over any length, B_inf. A map has Gaussians there

@@ -103,7 +103,7 @@ def variance_over_range(
     return float((slopes**2).mean() * spread)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Means of values that belong together: a point's observations, a region's points.
 
 
@@ -116,7 +116,7 @@ def mean_by(
     return np.stack([np.bincount(group, column) / count for column in values.T], axis=-1)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Computations with pauses: generators that yield every few milliseconds, so that no frame waits
 # for the whole of them.
 
@@ -136,7 +136,7 @@ def run_to_end(steps: Generator[None, None, Result]) -> Result:
             return result
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Regions of the scene, and what is known of their colours before anything is seen.
 #
 # What lies far away has on the whole the colours and the contrast of what lies near. Water changes

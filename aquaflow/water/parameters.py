@@ -207,7 +207,7 @@ class WaterUnknowns:
         return rows
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How the camera darkens its own picture: lamp and lens fall-off, fixed to the camera.
 #
 # A smooth gain g(x, y) = exp(q(x, y)) multiplies the whole picture, water included; q is a

@@ -171,7 +171,7 @@ def _grid() -> tuple[Array, Array]:
     return grid, weight / weight.sum()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A view's picture at every scale, with the range that the map has in it.
 
 LEVELS = 5

@@ -56,7 +56,7 @@ class WallClockWatch:
         return WallClockReading(monotonic, offset, change)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Whether the computer's clock can be believed: a board without a battery wakes up in the past.
 
 SYNCHRONISED = Path("run/systemd/timesync/synchronized")
@@ -99,7 +99,7 @@ def _seconds(clock: Path) -> int | None:
         return None
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A moment after which optional work is left out.
 
 Now = Callable[[], float]

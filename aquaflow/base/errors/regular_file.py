@@ -138,7 +138,7 @@ def _refuse(path: Path, name: str, folder: int, wanted: Any) -> None:
         raise OSError(errno.EINVAL, SPECIAL, str(path))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # YAML from untrusted files: small, plain, finite, or refused in one sentence.
 #
 # Every YAML file that AquaFlow reads comes through here. PyYAML's safe loader makes no objects of

@@ -166,7 +166,7 @@ def _refuse_long_directory(stream: BinaryIO) -> None:
         raise DamagedError("it lists more members than a dive has")
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Named arrays in a file of their own, which says whose it is and proves that it is undamaged.
 #
 # One line, ``CRC JSON``, and the arrays' bytes. The JSON is ``{"of": name, "arrays": {name: [dtype,
@@ -250,7 +250,7 @@ def _checksum(
     return checksum
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Arrays and facts in one file: a zip of arrays (``.npz``, uncompressed, without pickle) that has a
 # JSON text among them.
 

@@ -228,7 +228,7 @@ def write_yaml(path: Path, data: dict[str, Any], comment: str = "") -> None:
         stream.write(text.encode("utf-8"))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Arrays in files without a name, for what a command needs while it runs beyond its memory.
 
 
@@ -256,7 +256,7 @@ def scratch_array(folder: Path, shape: tuple[int, ...], dtype: npt.DTypeLike) ->
     return flat[: math.prod(shape)].reshape(shape)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Files of lines that are appended to, also after a power cut in the middle of a line.
 
 

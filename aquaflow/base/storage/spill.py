@@ -246,7 +246,7 @@ def _owner(path: Path) -> str:
     return f"{path.parent.name}/{path.stem}"
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Tables as CSV (RFC 4180) that a spreadsheet opens without running what stands in them.
 #
 # A spreadsheet takes a cell that starts with ``=``, ``+``, ``-`` or ``@`` for a formula, and a

@@ -102,7 +102,7 @@ def remove_abandoned(parent: Path, name: str = "") -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # One process writes to a folder: flock(2) on the folder itself, gone with the process.
 
 

@@ -44,7 +44,7 @@ OF_FINISHED_DIVES = frozenset({SPEED, FIX})
 """What a live connection does not have: trajectory.csv has it."""
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # ROS 2's message definitions and their CDR encoding, by rosbags: no ROS is needed.
 #
 # The messages used here have been the same in every ROS 2 release since Humble; a test compares

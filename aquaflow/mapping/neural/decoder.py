@@ -243,7 +243,7 @@ def _zero_linear(inputs: int, outputs: int) -> nn.Linear:
     return layer
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # View-dependent attributes of Gaussians: initial attributes plus decoded residuals.
 #
 # One view at a time goes through the compiled kernel; :func:`decoded_torch` is its definition, the
@@ -336,7 +336,7 @@ def without_residuals(
     }
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Voxel groups laid out for a decoder: groups of about the same fill side by side.
 
 BUCKET = 4
@@ -418,7 +418,7 @@ def _table(
     return torch.nn.functional.pad(table, (0, width - table.shape[1]), value=EMPTY)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The observation condition o = [v, d]: from where, and how far, a Gaussian is seen.
 #
 # Paper, Eq. 5 and 6. Gradients stop here: through the highest octave a step of the optimiser would

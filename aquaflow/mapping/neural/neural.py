@@ -448,7 +448,7 @@ class DecodedWindow:
         return True
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Groups, features and decoder of one sub-map: what is decoded, and not how it is learned.
 
 

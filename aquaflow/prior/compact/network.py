@@ -285,7 +285,7 @@ class Up(nn.Module):
         return refined
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # From encodings to matches of single pixels: coarse cell, then the fine descriptors around it.
 
 WINDOW = 6

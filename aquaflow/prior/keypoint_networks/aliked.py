@@ -97,7 +97,7 @@ class AlikedLightGlue:
         }
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Where the packages with code and weights are, and what to do where they are not.
 
 CODE = "kornia"
@@ -160,7 +160,7 @@ def load(module: torch.nn.Module, path: Path) -> None:
     module.eval().requires_grad_(False)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Which processor a network of torch runs on.
 
 
@@ -186,7 +186,7 @@ def torch_device(prior: str, asked: str) -> str:
     return asked
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # XFeat: keypoints of a small convolutional network, matched to each other's nearest.
 #
 # G. Potje and others, "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024.

@@ -200,7 +200,7 @@ def _spread(
     return sample(summed / (total + np.float32(MOTION_WEIGHT))[..., None], grid)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a keypoint network does: find points in one picture, and the same points in another.
 
 Picture = npt.NDArray[np.uint8]

@@ -127,7 +127,7 @@ def _graphs(network: Mast3r, width: int, height: int) -> tuple[EncoderGraph, Mas
     return EncoderGraph(network), Mast3rDecoderGraph(network, height // PATCH_PX, width // PATCH_PX)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Loading the public checkpoint, which the user brings, into our network.
 #
 # The file is read without running any code in it (``weights_only``): its ``args`` entry, an

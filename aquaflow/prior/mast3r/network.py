@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Sizes of the network: the public checkpoint's, and a tiny one of the same code for tests.
 
 PATCH_PX = 16
@@ -210,7 +210,7 @@ class Mast3r(nn.Module):
         return RotaryTable(table.cosine.to(device), table.sine.to(device))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Transformer blocks of encoder and decoders: pre-norm, rotary attention, GELU.
 #
 # Attribute names are those of the public checkpoint's tensors.
@@ -341,7 +341,7 @@ def _merge(
     return x.transpose(1, 2).flatten(2)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Rotary position embedding in two dimensions (RoPE; Su et al. 2021, here by row and column).
 #
 # The first half of a head's channels turns with the token's row, the second with its column. The
@@ -384,7 +384,7 @@ def _quarter_turned(
     return torch.cat([-b, a, -d, c], dim=-1)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # From tokens to pixels: the dense prediction head (DPT; Ranftl et al. 2021).
 #
 # Four layers of tokens become a pyramid, which is fused from coarse to fine. Attribute names are

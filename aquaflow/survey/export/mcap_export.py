@@ -250,7 +250,7 @@ class _Pictures:
         return len(shown)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # An MCAP file of ROS 2 messages, as ``ros2 bag`` writes and plays it, and Foxglove opens it.
 
 LIBRARY = "aquaflow"
@@ -313,7 +313,7 @@ def ros_file(path: Path, facts: Mapping[str, str]) -> Iterator[RosFile]:
         writer.finish()
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The layout that Foxglove and Lichtblick show a dive with: map and path, pictures, plots.
 
 COLOURS = ("#4e98e2", "#f5774d", "#f7df71", "#5cd6a9")

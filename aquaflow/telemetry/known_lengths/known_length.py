@@ -84,7 +84,7 @@ def scale_of(lengths: Sequence[KnownLength]) -> LengthScale | None:
     return LengthScale(float(np.exp(mean)), sigma, int(good.sum()), rejected)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # known_lengths.json of a dive: what was measured, and the scale of each sub-map that follows.
 
 FILE = "known_lengths.json"

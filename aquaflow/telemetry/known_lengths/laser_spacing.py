@@ -180,7 +180,7 @@ def _length(
     return KnownLength(frame_index, DOTS, length, map_sigma, lasers.spacing_m, sigma_m, a.sub_map)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Laser dots in a picture: small, bright, and of the laser's colour.
 
 CHANNEL = {"red": 0, "green": 1, "blue": 2}

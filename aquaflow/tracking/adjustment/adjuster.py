@@ -263,7 +263,7 @@ class KeyframePairs:
         )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The problem of an adjustment, put together from anchored points, links and a snapshot.
 
 KNOWN_SIGMA = 0.15

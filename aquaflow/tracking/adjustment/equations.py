@@ -199,7 +199,7 @@ def _point_derivatives(
     return np.concatenate([by_point * rho[None, :, None, None], turned, grown], axis=-1)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What tracking measured between keyframes, as a term of a joint adjustment.
 #
 # A link was solved from thousands of dense matches against depths that many frames were fused into:
@@ -237,7 +237,7 @@ class Links:
         return (self.T_ab.inverse() @ T_ba.inverse()).log(), T_ba
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Points anchored in keyframes: where they were sampled, and where other keyframes see them.
 
 Small = npt.NDArray[np.int16]

@@ -130,7 +130,7 @@ def _without_outliers(
     return replace(matches, used=matches.used & near)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The judge of an adjustment: reprojection error of points that took no part in it.
 #
 # Their depths are triangulate from the poses that are judged, so no depth of a pointmap is asked.

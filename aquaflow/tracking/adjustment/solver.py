@@ -156,7 +156,7 @@ def linearise(
     return System(total.matrix(), total.gradient, kept)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A sparse symmetric matrix of 7 x 7 blocks, one for each pair of poses, that sums are made in.
 #
 # Where its blocks are is known before they are: so a sum over anchors needs no more than the blocks
@@ -241,7 +241,7 @@ def _keys(
     return np.asarray((places[:, None] * free + places).ravel())
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How well an adjustment knows the relative poses that it found.
 
 CLUSTER = 4

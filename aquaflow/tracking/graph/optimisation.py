@@ -158,7 +158,7 @@ class Optimisation:
         )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Sparse Levenberg-Marquardt over only those poses of a keyframe graph that move.
 #
 # The active set starts at what is new and grows, in doubling reach, while a pose at its rim would
@@ -352,7 +352,7 @@ class Descent:
         self.poses = self.poses.replace(around.nodes[moving], misfit.poses[moving])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The sparse linear system of a pose graph: 7 x 7 blocks, factored by SuperLU (scipy).
 
 MEMORY = 10

@@ -246,7 +246,7 @@ def fused_pointmap(solution: Initialised, camera: CameraModel, sigma_px: float) 
     return pointmap
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Hypotheses of the geometry of frames matched to one reference; the best explains them.
 #
 # Essential-matrix and homography poses, at each focal length that may be, are extended to some of

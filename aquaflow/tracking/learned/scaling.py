@@ -240,7 +240,7 @@ def _apply(
     )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # The shift of inverse depths that a network knows up to scale and shift only.
 #
 # Such a network's inverse depth is d = g rho + c of the true one, rho. Where the keyframe's depths
@@ -323,7 +323,7 @@ def _slope_of_pairs(
     return float(np.median(rise[differ] / run[differ]))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a prior knows of a keyframe's depths, kept with those that are triangulated.
 
 

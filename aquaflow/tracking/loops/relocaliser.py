@@ -77,7 +77,7 @@ class Places:
         return None if proof is None else Relocalised(past, proof.estimate)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Which earlier keyframes may show the same place: an inverted file over the prior's descriptors.
 #
 # Each descriptor of a keyframe goes to the nearest of some thousand words; what it differs by from

@@ -137,7 +137,7 @@ def _occupied_cells(
     return len(np.unique(cell @ (1, GRID[0])))
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Keypoints of two pictures that show the same thing.
 
 Index = npt.NDArray[np.int64]
@@ -174,7 +174,7 @@ def match_keypoints(a: Keypoints, b: Keypoints) -> tuple[Index, Index]:
     return kept, nearest[kept]
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Keyframes that overlap with a frame, by the poses of the keyframe graph alone.
 
 SKETCH_POINTS = 64

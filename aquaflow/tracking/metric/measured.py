@@ -168,7 +168,7 @@ def _scale(factor: Factor, state: MetricState) -> tuple[Array, Array]:
     return misfit[:, None], sigma
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Telemetry as edges of the keyframe graph: from the world to single keyframes.
 #
 # The world n becomes a node of its own, whose pose T_mn the optimisation finds with the keyframes'.

@@ -185,7 +185,7 @@ def _join(
     return np.concatenate([first, second])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # A learned prior against drift of scale: its unit is the same from the first picture to the last.
 #
 # The unit of a keyframe's depths drifts along a dive by a little at every link. A network errs by
@@ -336,7 +336,7 @@ def _world(
     return World(component, T_mn, edges)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What the estimator needs of a dive at one moment, so that another thread may work on it.
 
 POINTS_OF_KEYFRAME = 600
@@ -435,7 +435,7 @@ def _similarities(
     return Sim3Batch(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Where objects of known size were seen in a dive, with what measuring them in the map needs.
 
 PlaceOf = Callable[[int], tuple[Sim3, int] | None]

@@ -205,7 +205,7 @@ def own_points(
     return OwnPoints(np.where(known[:, None], rays * z[:, None], np.nan), variance)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Inverse depth around every pixel of a pointmap, without the pixel's own error.
 #
 # Depths are known to a few percent, and what is multiplied or selected by them shares their noise:
@@ -264,7 +264,7 @@ def _mean_around(
     return np.asarray(np.where(everywhere > 0.0, everywhere, rho), dtype=np.float32)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What a frame should show of a keyframe, and how much of that was matched.
 #
 # Matches are lost for two reasons. Where the view has moved on, a new keyframe brings them back;
@@ -395,7 +395,7 @@ def agreeing(
     return out
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Where a keyframe's pixels are expected in the next frame, if its motion is known beforehand.
 
 WIDE_WIDTHS = 0.04
@@ -440,7 +440,7 @@ def _points(pointmap: Pointmap, down: int = 1, across: int = 1) -> npt.NDArray[n
     return np.asarray(rays / np.where(known, rho, usual)[..., None])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Matches with a keyframe's pointmap as the problem that the pose solver solves.
 
 
@@ -464,7 +464,7 @@ def pose_problem(
     )
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Pose of a frame from its matches alone, where no prediction helps.
 
 RANSAC_ITERATIONS = 200

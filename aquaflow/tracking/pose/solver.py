@@ -185,7 +185,7 @@ def _summary(
     return PoseEstimate(T, covariance, share, residual_px, degeneracy.conditioning, degeneracy)
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Uncertainty of a solved pose: covariance and degeneracy from its normal equations.
 #
 # Translation is counted in median depths here, so that it and rotation are both angles.
@@ -282,7 +282,7 @@ def cell_sums(
     return np.stack([np.bincount(cell, each, down * CELLS_ACROSS) for each in scores])
 
 
-# --- ----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Cost and normal equations by the pixel residual in compiled code (native/pose_equations.h).
 
 _COLUMNS = ("X", "Y", "Z", "variance", "u", "v", "weights", "nearer")
