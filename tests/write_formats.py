@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.dive.frames_csv import FRAME_COLUMNS, FrameRow
-from aquaflow.survey.export.ortho.layers import NODATA, RasterFile
+from aquaflow.survey.export.ortho.grid import NODATA, RasterFile
 from aquaflow.types import KINDS, STAMP
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "formats.md"

@@ -392,7 +392,7 @@ def video(
             count = fly_through(read, out, flight_s, water, width, progress)
             said, facts = f"Wrote a flight of {count} pictures to {out}.", {"frames": count}
         elif kind is VideoKind.side_by_side:
-            from aquaflow.survey.video.side_by_side import side_by_side
+            from aquaflow.survey.video.every_frame import side_by_side
 
             count = side_by_side(read, out, recording, progress)
             said, facts = f"Wrote {count} frames side by side to {out}.", {"frames": count}

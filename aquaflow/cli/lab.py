@@ -220,8 +220,8 @@ def batch(
     )  # fmt: skip
     from aquaflow.lab.batch.batch import run_batch
     from aquaflow.lab.batch.membership import Sites
-    from aquaflow.survey.site.adding import add_to_site
     from aquaflow.survey.site.manifest import is_site
+    from aquaflow.survey.site.merging import add_to_site
 
     with progress_bars(quiet=as_json) as progress:
         batched = run_batch(

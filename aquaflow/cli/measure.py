@@ -17,8 +17,8 @@ from aquaflow.cli.console import GroupWithDefault, Json, progress_bars
 if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
     from aquaflow.survey.measure.answers import PointMeasurements
+    from aquaflow.survey.measure.quantity import LengthUnit
     from aquaflow.survey.measure.reef_numbers import ReefNumbers
-    from aquaflow.survey.measure.units import LengthUnit
     from aquaflow.telemetry.known_lengths.known_length import KnownLength
 
 
@@ -91,7 +91,7 @@ def measure(
         raise InputError("--as and --note need points; give --point for each")
     read = _with_map(dive)
     from aquaflow.survey.measure.finished_dive import numbers_of_dive
-    from aquaflow.survey.measure.reef_files import write_csv
+    from aquaflow.survey.measure.reef_numbers import write_csv
 
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
         found: PointMeasurements | ReefNumbers
@@ -159,8 +159,7 @@ def _pin(dive: Dive, text: str, found: Any) -> None:
 
 def _in_words(found: Any, unit: LengthUnit) -> str:
     """Lines for people; of an answer or of reef numbers."""
-    from aquaflow.survey.measure.quantity import Quantity
-    from aquaflow.survey.measure.units import as_read
+    from aquaflow.survey.measure.quantity import Quantity, as_read
 
     def read(length: float, of: str) -> Quantity:
         return as_read(Quantity(length, 0.0, length, length, of), unit)
@@ -223,7 +222,7 @@ def scale(
     for name, value in (("length", length), ("sigma", sigma)):
         if not (math.isfinite(value) and value > 0.0):
             raise typer.BadParameter(f"--{name} must be a positive number of metres")
-    from aquaflow.survey.measure.marked_length import keep_length
+    from aquaflow.survey.measure.scale_bar import keep_length
     from aquaflow.telemetry.known_lengths.known_length import FILE, read_known_lengths
 
     read_known_lengths(dive)  # a damaged file is found before the map is drawn

@@ -187,8 +187,10 @@ def _mark(
 ) -> tuple[str, bool]:
     """Keep a length that was marked in the viewer; what came of it, and whether files changed."""
     from aquaflow.dive.dive import Dive
-    from aquaflow.survey.measure.marked_length import keep_length
-    from aquaflow.survey.measure.scale_bar import between_points  # loads torch
+    from aquaflow.survey.measure.scale_bar import (
+        between_points,  # loads torch
+        keep_length,
+    )
 
     marked = keep_length(dive, between_points(Dive(dive), *ends, length_m, sigma_m))
     return f"{marked.in_words()}\n{marked.unchanged or ''}".rstrip(), marked.unchanged is None

@@ -28,7 +28,7 @@ def add(
     as_json: Json = False,
 ) -> None:
     """Add finished dives to a site, which is made if it is not there."""
-    from aquaflow.survey.site.adding import add_to_site
+    from aquaflow.survey.site.merging import add_to_site
 
     new = add_to_site(site, dives)
     if as_json:
@@ -62,7 +62,7 @@ def write_map(
     as_json: Json = False,
 ) -> None:
     """One map of the merged dives: of every place the dive that shows it last, or much closer."""
-    from aquaflow.survey.change.make_site_map import make_site_map
+    from aquaflow.survey.change.site_map import make_site_map
 
     with progress_bars(quiet=as_json) as progress, tempfile.TemporaryDirectory() as work:
         made = make_site_map(site, component, Path(work), progress)

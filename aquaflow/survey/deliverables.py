@@ -10,7 +10,7 @@ from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.deliverables import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.finished_dive import numbers_at_the_end
-from aquaflow.survey.measure.reef_files import write_reef_numbers
+from aquaflow.survey.measure.reef_numbers import write_reef_numbers
 from aquaflow.survey.report import write_report
 from aquaflow.survey.report.report_of import OVERVIEW, report_of
 
@@ -25,7 +25,7 @@ class Overview(Deliverable):
         mapper = dive.maps.get(dive.main)
         if mapper is None or not mapper.views or not len(mapper.gaussians):
             return
-        from aquaflow.survey.export.ortho.overview import overview_png
+        from aquaflow.survey.export.ortho.survey import overview_png
 
         picture = overview_png(mapper, dive.frame)
         with atomic_write(dive.file(OVERVIEW)) as stream:

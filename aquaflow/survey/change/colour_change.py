@@ -21,7 +21,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
-from aquaflow.survey.change.neighbours import means_by, pairs_within, parts
+from aquaflow.survey.change.m3c2 import means_by, pairs_within, parts
 from aquaflow.survey.change.significance import measured_spread
 from aquaflow.survey.change.surface import Surface
 

@@ -18,8 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.spill import csv_text
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.change.change_picture import change_png
-from aquaflow.survey.change.change_raster import write_change_raster
+from aquaflow.survey.change.change_picture import change_png, write_change_raster
 from aquaflow.survey.change.comparison import NOT_SEEN, UNCHANGED, SurfaceComparison, compare
 from aquaflow.survey.change.moved import with_moves
 from aquaflow.survey.change.patches import NAMES, Patch, find_patches

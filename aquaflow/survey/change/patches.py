@@ -21,7 +21,7 @@ from aquaflow.survey.change.comparison import (
     UNCHANGED,
     SurfaceComparison,
 )
-from aquaflow.survey.change.neighbours import pairs_within
+from aquaflow.survey.change.m3c2 import pairs_within
 from aquaflow.survey.change.relief import ReliefWindow, fill
 from aquaflow.survey.change.surface import Surface
 

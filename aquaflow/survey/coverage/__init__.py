@@ -2,12 +2,11 @@
 
 from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.dive_coverage import DiveCoverage
-from aquaflow.survey.coverage.footprint import Footprint
-from aquaflow.survey.coverage.next_line import LineState, Suggestion
+from aquaflow.survey.coverage.footprint import Footprint, mapping_range, visibility
 from aquaflow.survey.coverage.page_view import PageView, page_view
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
-from aquaflow.survey.coverage.water_range import mapping_range, visibility
+from aquaflow.survey.coverage.survey_lines import LineState, Suggestion
 
 __all__ = [
     "COLOURS",

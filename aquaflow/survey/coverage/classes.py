@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.service import CoverageConfig
-from aquaflow.survey.coverage.raster import RANGE_BINS, GridFrame
-from aquaflow.survey.coverage.tiles import Counts, Sides
+from aquaflow.survey.coverage.raster import RANGE_BINS, Counts, GridFrame, Sides
 
 Classes = npt.NDArray[np.uint8]
 

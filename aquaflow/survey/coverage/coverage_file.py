@@ -16,11 +16,10 @@ from aquaflow.base.errors.regular_file import LARGEST_JSON_BYTES
 from aquaflow.base.storage.archive import UNREADABLE, read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.survey.coverage.classes import CoverageClass
-from aquaflow.survey.coverage.next_line import LineState, Suggestion
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.raster import GridFrame
-from aquaflow.survey.coverage.survey_lines import SurveyLine
+from aquaflow.survey.coverage.survey_lines import LineState, Suggestion, SurveyLine
 
 NAME = "coverage.npz"
 """In a dive's folder (docs/formats.md#coverage)."""

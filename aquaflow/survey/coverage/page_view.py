@@ -10,10 +10,9 @@ import numpy.typing as npt
 from aquaflow.config.service import CoverageConfig
 from aquaflow.dive.placement import names_of, page_axes
 from aquaflow.survey.coverage.classes import CoverageClass
-from aquaflow.survey.coverage.next_line import LineState, line_state
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
-from aquaflow.survey.coverage.survey_lines import survey_lines
+from aquaflow.survey.coverage.survey_lines import LineState, line_state, survey_lines
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
 from aquaflow.telemetry.world_frame import WorldFrame
 

@@ -10,9 +10,8 @@ import numpy.typing as npt
 from aquaflow.config.service import CoverageConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.classes import Classes, CoverageClass, classify, near_bins
-from aquaflow.survey.coverage.layer import CoverageLayer
-from aquaflow.survey.coverage.raster import GridFrame
-from aquaflow.survey.coverage.tiles import TILE
+from aquaflow.survey.coverage.footprint import Footprint
+from aquaflow.survey.coverage.raster import TILE, GridFrame, Tiles, cells_seen
 
 Array = npt.NDArray[np.float64]
 
@@ -124,3 +123,29 @@ def plan_of(
         frame, (float(corner[0]), float(corner[1])), step * frame.cell, classes, views, directions,
         nearest, limit, {seen: int(counts[seen]) for seen in CoverageClass},
     )  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# One grid and the keyframes that are counted in it, each with the pose that it was counted by.
+
+Sight = tuple[Footprint, Sim3]
+"""A footprint and T_mc."""
+
+
+class CoverageLayer:
+    """Counts that are at any time those of the keyframes in ``drawn``, whatever came before."""
+
+    def __init__(self, frame: GridFrame) -> None:
+        self.frame = frame
+        self.tiles = Tiles()
+        self.drawn: dict[int, Sight] = {}
+        """By the keyframe's number."""
+
+    def draw(self, number: int, seen: Sight | None) -> None:
+        """Count a keyframe as ``seen``, in place of how it was counted; None: no more."""
+        before = self.drawn.pop(number, None)
+        if before is not None:
+            self.tiles.remove(cells_seen(*before, self.frame))
+        if seen is not None:
+            self.tiles.add(cells_seen(*seen, self.frame))
+            self.drawn[number] = seen

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.survey.coverage.footprint import Footprint
-from aquaflow.survey.coverage.layer import CoverageLayer, Sight
+from aquaflow.survey.coverage.plan import CoverageLayer, Sight
 from aquaflow.survey.coverage.raster import GridFrame
 
 Array = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.coverage.layer import Sight
+from aquaflow.survey.coverage.plan import Sight
 
 Array = npt.NDArray[np.float64]
 

@@ -18,11 +18,16 @@ from aquaflow.survey.measure.asked import Asked, GeodeticPoint, locate
 from aquaflow.survey.measure.drawn_heights import Progress, draw_heights
 from aquaflow.survey.measure.height_field import HeightField
 from aquaflow.survey.measure.points import MeasuredPoints
-from aquaflow.survey.measure.profile import GroundProfile, profile
-from aquaflow.survey.measure.quantity import Quantity
+from aquaflow.survey.measure.quantity import Quantity, Scale, scale_of
 from aquaflow.survey.measure.roughness import MATCH_SIGMA, surface_ratio
-from aquaflow.survey.measure.scale import Scale, scale_of
-from aquaflow.survey.measure.shapes import LEAST_CORNERS, area, path_length, plan_area
+from aquaflow.survey.measure.shapes import (
+    LEAST_CORNERS,
+    GroundProfile,
+    area,
+    path_length,
+    plan_area,
+    profile,
+)
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.sightings import SOLID
 

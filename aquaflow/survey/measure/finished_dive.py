@@ -14,8 +14,8 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
 from aquaflow.survey.measure.height_field import HeightField
+from aquaflow.survey.measure.quantity import scale_of
 from aquaflow.survey.measure.reef_numbers import DiveWater, ReefNumbers, reef_numbers
-from aquaflow.survey.measure.scale import scale_of
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from aquaflow.telemetry.world_frame import WorldFrame
 
 NORMAL_95 = 1.959964
 """Standard deviations on each side of the mean that hold 95 % of a normal distribution."""
@@ -42,3 +44,56 @@ class Quantity:
             "value": self.value, "sigma": self.sigma,
             "low_95": self.low, "high_95": self.high, "unit": self.unit,
         }  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# The unit that people read lengths and areas in; files and JSON are in metres always.
+
+LengthUnit = Literal["metres", "feet"]
+
+FOOT_M = 0.3048
+"""The international foot, m, exactly (NIST Handbook 44, appendix C)."""
+FEET = {"m": ("ft", FOOT_M), "m\u00b2": ("ft\u00b2", FOOT_M**2)}
+"""Unit, and how much of the metric one it is."""
+
+
+def as_read(quantity: Quantity, unit: LengthUnit) -> Quantity:
+    """The same in ``unit``; what is no metric length or area, as angles and map units, stays."""
+    if unit == "metres" or quantity.unit not in FEET:
+        return quantity
+    name, size = FEET[quantity.unit]
+    value, sigma, low, high = (
+        each / size for each in (quantity.value, quantity.sigma, quantity.low, quantity.high)
+    )
+    return replace(quantity, value=value, sigma=sigma, low=low, high=high, unit=name)
+
+
+# --------------------------------------------------------------------------------------------------
+# The unit of a dive's lengths, and how well scale and vertical are known.
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What multiplies all lengths of a dive together, and turns all of it."""
+
+    unit: str
+    """Of lengths: ``m`` or ``map units``."""
+    sigma: float
+    """Relative 1 sigma of the scale. 0 in map units: there is no other ruler that it could differ
+    from."""
+    tilt_sigma_rad: float
+    """1 sigma of the direction of the vertical; 0 where it is a convention and not gravity."""
+
+    @property
+    def square_unit(self) -> str:
+        """Of areas."""
+        return "m\u00b2" if self.unit == "m" else f"square {self.unit}"
+
+
+def scale_of(frame: WorldFrame) -> Scale:
+    """Of the lengths in n of a sub-map."""
+    return Scale(
+        frame.unit,
+        frame.scale_sigma if frame.metric else 0.0,
+        frame.tilt_sigma_rad if frame.level else 0.0,
+    )

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.coverage.water_range import VISIBLE_CONTRAST
+from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.base.storage.spill import csv_text
+from aquaflow.survey.coverage.footprint import VISIBLE_CONTRAST
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
-from aquaflow.survey.measure.areas import WELL_SEEN, areas
+from aquaflow.survey.measure.areas import WELL_SEEN, areas, way
 from aquaflow.survey.measure.height_field import HeightField
-from aquaflow.survey.measure.path import way
-from aquaflow.survey.measure.quantity import NORMAL_95, Quantity
+from aquaflow.survey.measure.quantity import NORMAL_95, Quantity, Scale
 from aquaflow.survey.measure.roughness import (
     RELIEF_PERCENT,
     chain_ratio,
@@ -24,7 +26,6 @@ from aquaflow.survey.measure.roughness import (
     slope,
     surface_ratio,
 )
-from aquaflow.survey.measure.scale import Scale
 
 Array = npt.NDArray[np.float64]
 
@@ -210,3 +211,30 @@ def visibility(
     # A rate's error is one of its logarithm: twice the rate is as likely as half of it.
     factor = math.exp(NORMAL_95 * relative)
     return Quantity(value, value * relative, value / factor, value * factor, scale.unit)
+
+
+# --------------------------------------------------------------------------------------------------
+# ``reef_numbers.json`` and ``reef_numbers.csv``.
+
+JSON, CSV = "reef_numbers.json", "reef_numbers.csv"
+"""In the dive folder."""
+
+
+def write_reef_numbers(folder: Path, found: ReefNumbers) -> None:
+    """Write both files.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    write_json(folder / JSON, found.to_json())
+    write_csv(folder / CSV, found.rows())
+
+
+def write_csv(path: Path, rows: list[list[str]]) -> None:
+    """Write a table with its head.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_write(path) as stream:
+        stream.write(csv_text(rows).encode("utf-8"))

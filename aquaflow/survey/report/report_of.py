@@ -19,7 +19,7 @@ from aquaflow.survey.coverage import PageView
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.measure.quantity import Quantity
-from aquaflow.survey.measure.reef_files import JSON as REEF
+from aquaflow.survey.measure.reef_numbers import JSON as REEF
 from aquaflow.survey.report import (
     CameraSummary,
     DepthProfile,

@@ -11,7 +11,7 @@ import numpy as np
 
 from aquaflow.survey.coverage import WORDS, CoverageClass, PageView, visibility
 from aquaflow.survey.report.data import DepthProfile, LeftOut, MediumCurves, ReportData
-from aquaflow.survey.report.survey_figures import coverage_svg, profile_svg
+from aquaflow.survey.report.figures import coverage_svg, profile_svg
 
 Rows = list[tuple[str, ...]]
 

@@ -22,10 +22,9 @@ from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.places_file import PlacesFile
-from aquaflow.survey.site.joining import join
+from aquaflow.survey.site.joining import CrossLink, find_links, join
 from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_of
-from aquaflow.survey.site.links import CrossLink, find_links
-from aquaflow.survey.site.manifest import SiteDive, read_site, state_of
+from aquaflow.survey.site.manifest import NAME, SiteDive, add_dives, read_site, state_of
 from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_merged
 from aquaflow.survey.site.placing import place
 from aquaflow.survey.site.site_log import say
@@ -192,3 +191,26 @@ def _of_json(stated: dict[str, Any]) -> CrossLink:
         int(stated["a"]), int(stated["b"]), T, information, inliers, matched, cells,
         float(stated["similarity"]),
     )  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# ``aquaflow site add``: dives into a site, by one process at a time.
+
+
+def add_to_site(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
+    """Add dive folders to the site, which is made if it is not there; the dives that are new, or
+    were mapped again since they were added. The dives themselves are not touched.
+
+    Raises:
+        InputError: a folder is no finished dive, another process writes to the site, or it cannot
+            be read or written.
+    """
+    lock = FolderLock(site) if (site / NAME).exists() else None
+    try:
+        new = add_dives(site, folders)
+    finally:
+        if lock is not None:
+            lock.release()
+    for dive in new:
+        say(site, "added", dive=dive.name, fingerprint=dive.fingerprint)
+    return new

@@ -20,7 +20,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.transfers import checkpoint_in, picture_out
 from aquaflow.render.views import View, in_time
-from aquaflow.survey.export.ortho.colours import Colours
+from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.video.encoder import check_name, video_file
 
 Progress = Callable[[int, int], None]
@@ -45,7 +45,7 @@ def fly_through(
     """Write a flight of ``seconds`` through the largest sub-map; returns how many pictures it has.
 
     Without ``water``, colours are bounded as those of an ortho: each Gaussian is recovered at the
-    range from which the nearest view saw it (:mod:`aquaflow.survey.export.ortho.colours`).
+    range from which the nearest view saw it (:mod:`aquaflow.survey.export.ortho.drawing`).
 
     Raises:
         InputError: the dive has no map, or the file cannot be written.

@@ -20,12 +20,11 @@ from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path
 from aquaflow.survey.viewer.levels import Palette
 from aquaflow.survey.viewer.measuring import Asked, LengthUnit, vector
-from aquaflow.survey.viewer.packed_file import PackedFile, key_of, read_packed, write_packed
+from aquaflow.survey.viewer.packing import PackedFile, key_of, read_packed, write_packed
 from aquaflow.survey.viewer.page import ViewerPage
-from aquaflow.survey.viewer.pinned_notes import PinnedNotes
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.survey.viewer.splats import ViewerSplats
-from aquaflow.survey.viewer.tools import SCALE, Tools
+from aquaflow.survey.viewer.tools import SCALE, PinnedNotes, Tools
 from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)

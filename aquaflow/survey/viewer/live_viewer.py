@@ -20,8 +20,8 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.survey.coverage.plan import CoveragePlan
-from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
+from aquaflow.survey.measure.quantity import Scale
+from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level, steps_level
 from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import moments

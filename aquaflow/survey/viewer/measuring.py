@@ -12,10 +12,8 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.points import MeasuredPoints
-from aquaflow.survey.measure.profile import profile
-from aquaflow.survey.measure.quantity import Quantity
-from aquaflow.survey.measure.scale import Scale, scale_of
-from aquaflow.survey.measure.shapes import area, path_length, plan_area
+from aquaflow.survey.measure.quantity import Quantity, Scale, scale_of
+from aquaflow.survey.measure.shapes import area, path_length, plan_area, profile
 from aquaflow.survey.viewer.picking import PickedGaussian, pick, within_reach
 from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.telemetry.world_frame import WorldFrame

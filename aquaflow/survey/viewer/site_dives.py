@@ -13,8 +13,8 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import SiteDive, check_unchanged, read_site
 from aquaflow.survey.site.merged_file import MergedSite, PlacedSubMap, merge_of
-from aquaflow.survey.site.paths import sub_maps_of_frames
 from aquaflow.survey.site.site_map_file import SiteMapPart, parts_of
+from aquaflow.survey.site.site_paths import sub_maps_of_frames
 from aquaflow.survey.viewer.dive_path import DivePath
 from aquaflow.survey.viewer.finished import FinishedDive, finished_dive
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -15,14 +15,13 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, read_ply
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.site_map_file import join, read_site_map
-from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
-from aquaflow.survey.viewer.dive_map import DiveMap
+from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE, DiveMap, coverage_of_dive
 from aquaflow.survey.viewer.dive_path import LONGEST_PATH
 from aquaflow.survey.viewer.finished import frame_in_words, prepare
 from aquaflow.survey.viewer.levels import RANGE, RGB, Palette, range_level
 from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import HEADING, PICTURE
-from aquaflow.survey.viewer.packed_file import read_packed
+from aquaflow.survey.viewer.packing import read_packed
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.site_dives import PlacedDive, ShownSite, read_shown
 from aquaflow.survey.viewer.splats import Levels, splats

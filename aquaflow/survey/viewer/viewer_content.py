@@ -25,8 +25,7 @@ from aquaflow.dive.png import read_png
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.levels import Palette
 from aquaflow.survey.viewer.moments import MOMENT_NUMBERS
-from aquaflow.survey.viewer.packed_file import PackedFile
-from aquaflow.survey.viewer.packing import Packed
+from aquaflow.survey.viewer.packing import Packed, PackedFile
 from aquaflow.survey.viewer.seen_water import SeenWater
 from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.types import CameraModel

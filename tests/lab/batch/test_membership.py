@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 from aquaflow.lab.batch.membership import Sites, add_members, make_site
-from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.manifest import is_site, read_site
+from aquaflow.survey.site.merging import add_to_site
 from tests.command_line import Cli
 from tests.lab.batch.seasons import SHORT, season
 

@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config.service import VehicleReportConfig
 from aquaflow.live.vehicle.pilot_messages import REPEAT_S, PilotMessages
-from aquaflow.survey.coverage.hints import SENTENCES, Hint
+from aquaflow.survey.coverage.live_coverage import SENTENCES, Hint
 from tests.drivers.simulated_links import Running, mavlink_udp, motion, running, until
 from tests.live.live_scenes import Told
 from tests.survey.coverage.covered_dives import CoveredDive

@@ -17,7 +17,7 @@ from aquaflow.live.health.pressure import Shortage
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.vehicle.pilot_messages import REPEAT_S, SEVERITY, SPACING_S, PilotMessages
 from aquaflow.sources.outbound import LONGEST_TEXT, StatusText
-from aquaflow.survey.coverage.hints import SENTENCES
+from aquaflow.survey.coverage.live_coverage import SENTENCES
 from aquaflow.tracking.consistency import Cause, InconsistentKeyframe
 from tests.live.live_scenes import CALM, Told
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.change.change_raster import bands_of, grid_of
+from aquaflow.survey.change.change_picture import bands_of, grid_of
 from aquaflow.survey.change.comparison import (
     BLEACHED,
     GAINED,

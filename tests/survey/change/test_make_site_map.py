@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from aquaflow.dive.ply import read_ply
-from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.manifest import fingerprint
 from aquaflow.survey.site.merged_file import NAME as MERGED
-from aquaflow.survey.site.merging import merge
+from aquaflow.survey.site.merging import add_to_site, merge
 from aquaflow.survey.site.site_map_file import names_of
 from aquaflow.survey.viewer.site_dives import read_shown
 from aquaflow.survey.viewer.site_page import DIVE, map_of_site

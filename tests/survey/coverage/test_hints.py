@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config.service import CoverageConfig
-from aquaflow.survey.coverage.hints import (
+from aquaflow.survey.coverage.live_coverage import (
     LEAST_STEPS,
     CoverageFigures,
     Hint,

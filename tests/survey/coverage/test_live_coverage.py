@@ -14,7 +14,7 @@ from aquaflow.config.service import ListenConfig
 from aquaflow.live.health.http import HealthServer
 from aquaflow.live.plan_view import PlanView
 from aquaflow.survey.coverage.classes import CoverageClass
-from aquaflow.survey.coverage.hints import Hint
+from aquaflow.survey.coverage.live_coverage import Hint
 from aquaflow.survey.coverage.picture import HEIGHT, WIDTH
 from tests.live.health.reports import REPORT
 from tests.survey.coverage.covered_dives import CoveredDive

@@ -12,11 +12,9 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.coverage import sub_map_coverage
 from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.footprint import BLOCKS, Footprint
-from aquaflow.survey.coverage.layer import CoverageLayer
-from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
-from aquaflow.survey.coverage.raster import cells_seen
+from aquaflow.survey.coverage.plan import CoverageLayer, CoveragePlan, plan_of
+from aquaflow.survey.coverage.raster import TILE_BYTES, cells_seen
 from aquaflow.survey.coverage.sub_map_coverage import REDRAWN, SubMapCoverage
-from aquaflow.survey.coverage.tiles import TILE_BYTES
 from tests.survey.coverage.surveys import (  # fmt: skip
     ALTITUDE,
     CAMERA,

@@ -12,8 +12,7 @@ from aquaflow.dive.point_cloud import PosedView
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.mesh.blocks import Blocks
-from aquaflow.survey.export.mesh.fusion import fuse
-from aquaflow.survey.export.mesh.surface import SurfaceBuilder
+from aquaflow.survey.export.mesh.surface import SurfaceBuilder, fuse
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, surface_layers, unit_rays
 

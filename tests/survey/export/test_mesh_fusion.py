@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.survey.export.mesh import atlas as colouring
 from aquaflow.survey.export.mesh import blocks as blocks_module
-from aquaflow.survey.export.mesh import colouring
-from aquaflow.survey.export.mesh.atlas import lay_out, paint
+from aquaflow.survey.export.mesh.atlas import lay_out, look_at, paint
 from aquaflow.survey.export.mesh.blocks import Blocks, truncation
-from aquaflow.survey.export.mesh.colouring import look_at
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from tests.survey.export.mesh_scenes import (
     FAR_CAMERA,

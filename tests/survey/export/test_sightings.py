@@ -12,7 +12,7 @@ import torch
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.survey.export.ortho.colours import Colours
+from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
 from aquaflow.survey.export.ortho.sightings import ViewRanges
 from aquaflow.water.exposure import WhiteBalance

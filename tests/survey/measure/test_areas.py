@@ -10,8 +10,7 @@ import pytest
 
 from aquaflow.survey.measure.areas import Areas, areas
 from aquaflow.survey.measure.height_field import HeightField, Held
-from aquaflow.survey.measure.quantity import Quantity
-from aquaflow.survey.measure.scale import Scale
+from aquaflow.survey.measure.quantity import Quantity, Scale
 from tests.survey.measure.fields import CELL, field
 
 RADIUS, EDGE = 2.2, 0.05

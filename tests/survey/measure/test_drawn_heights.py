@@ -14,8 +14,8 @@ from aquaflow.survey.export.ortho.ground import Ground, ground_of
 from aquaflow.survey.measure.areas import areas
 from aquaflow.survey.measure.drawn_heights import draw_heights, found_cell
 from aquaflow.survey.measure.height_field import HeightField
+from aquaflow.survey.measure.quantity import Scale
 from aquaflow.survey.measure.roughness import chain_ratio, relief, surface_ratio
-from aquaflow.survey.measure.scale import Scale
 from tests.metric_scenes import metric_frame
 from tests.survey.export.survey_scenes import (
     ALTITUDE_M,

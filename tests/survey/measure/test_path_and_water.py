@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.survey.measure.path import way
+from aquaflow.survey.measure.areas import way
+from aquaflow.survey.measure.quantity import Scale
 from aquaflow.survey.measure.reef_numbers import visibility
-from aquaflow.survey.measure.scale import Scale
 
 METRES = Scale("m", 0.01, 0.0)
 

@@ -8,8 +8,8 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.points import MeasuredPoints
-from aquaflow.survey.measure.profile import profile
-from aquaflow.survey.measure.scale import Scale
+from aquaflow.survey.measure.quantity import Scale
+from aquaflow.survey.measure.shapes import profile
 
 Array = npt.NDArray[np.float64]
 

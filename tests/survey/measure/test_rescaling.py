@@ -16,8 +16,8 @@ from aquaflow.dive.ply import read_ply
 from aquaflow.dive.trajectory_csv import read_trajectory_csv
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.measure import finished_dive
-from aquaflow.survey.measure.marked_length import keep_length
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
+from aquaflow.survey.measure.scale_bar import keep_length
 from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.metric_file import read_metric_file, write_metric_file

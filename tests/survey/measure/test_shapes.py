@@ -10,8 +10,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.points import MOST_POINTS, MeasuredPoints
-from aquaflow.survey.measure.quantity import Quantity
-from aquaflow.survey.measure.scale import Scale, scale_of
+from aquaflow.survey.measure.quantity import Quantity, Scale, scale_of
 from aquaflow.survey.measure.shapes import area, distance, path_length, plan_area
 from tests.metric_scenes import SIGMAS, metric_frame
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aquaflow.survey.measure.quantity import Quantity
-from aquaflow.survey.measure.units import as_read
+from aquaflow.survey.measure.quantity import Quantity, as_read
 
 
 def test_metres_become_feet_with_their_sigma_and_interval() -> None:

@@ -10,8 +10,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.keyframes.places_file import NAME, PlacesFile
-from aquaflow.survey.site.adding import add_to_site
-from aquaflow.survey.site.merging import merge
+from aquaflow.survey.site.merging import add_to_site, merge
 from aquaflow.tracking.base import base_of
 
 

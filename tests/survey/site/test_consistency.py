@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.site.consistency import LEAST_AGREEING, Mask, agreement, compatible_links
+from aquaflow.survey.site.joining import LEAST_AGREEING, Mask, agreement, compatible_links
 from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.loop_admission import Chains
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph

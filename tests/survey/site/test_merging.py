@@ -14,12 +14,11 @@ from aquaflow.dive.tum import read_tum
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.survey.site import merging
-from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.checking import check_site
-from aquaflow.survey.site.links import CrossLink
+from aquaflow.survey.site.joining import CrossLink
 from aquaflow.survey.site.manifest import SiteDive
 from aquaflow.survey.site.merged_file import MergedSite, read_merged
-from aquaflow.survey.site.merging import merge
+from aquaflow.survey.site.merging import add_to_site, merge
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from tests.survey.site.site_dives import SPACING, Scene, stated_dive
 

@@ -13,9 +13,8 @@ from aquaflow.dive.tum import read_tum
 from aquaflow.geometry.alignment import align
 from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.sources import open_recording
-from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.merged_file import MergedSite
-from aquaflow.survey.site.merging import merge
+from aquaflow.survey.site.merging import add_to_site, merge
 from tests.made_once import made_once
 from tests.small_recording import FRAMES, HEIGHT, WIDTH
 

@@ -11,7 +11,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.video.encoder import VideoEncoder, video_file
-from aquaflow.survey.video.timeline import Timeline, usual_fps
+from aquaflow.survey.video.overlay import Timeline, usual_fps
 from tests.survey.video.player import stated_times
 
 Picture = npt.NDArray[np.uint8]

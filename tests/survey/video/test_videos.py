@@ -17,10 +17,14 @@ from aquaflow.dive.deliverables import read_finished_frames
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import exposure_without_water, restored_frames, seen_frames
 from aquaflow.mapping.restoration import to_bytes
-from aquaflow.survey.video.every_frame import LONGEST_GAP_S, CameraPoses, restore_every_frame
+from aquaflow.survey.video.every_frame import (
+    LONGEST_GAP_S,
+    CameraPoses,
+    restore_every_frame,
+    side_by_side,
+)
 from aquaflow.survey.video.fly_through import FPS, fly_through
 from aquaflow.survey.video.overlay import GROUND
-from aquaflow.survey.video.side_by_side import side_by_side
 from aquaflow.telemetry.metric_file import read_frame_of_map
 from tests.browser import needs_browser
 from tests.command_line import Cli, refused

@@ -9,7 +9,7 @@ import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.state import MapCopy
-from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
+from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.live_viewer import pack_for_browser
 
 

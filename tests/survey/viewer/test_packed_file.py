@@ -14,7 +14,7 @@ from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.viewer import finished
 from aquaflow.survey.viewer.finished import FinishedDive, finished_dive, prepare, show_dive
-from aquaflow.survey.viewer.packed_file import NAME, key_of, read_packed
+from aquaflow.survey.viewer.packing import NAME, key_of, read_packed
 from aquaflow.survey.viewer.page import ViewerPage
 
 BUDGET = 500

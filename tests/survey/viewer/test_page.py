@@ -20,9 +20,8 @@ from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.finished import finished_dive, open_dive
 from aquaflow.survey.viewer.page import ViewerPage
-from aquaflow.survey.viewer.pinned_notes import PinnedNotes
 from aquaflow.survey.viewer.splats import splats
-from aquaflow.survey.viewer.tools import Tools
+from aquaflow.survey.viewer.tools import PinnedNotes, Tools
 from aquaflow.telemetry.metric_file import write_metric_file
 from tests.metric_scenes import metric_frame
 from tests.small_recording import HEIGHT, WIDTH

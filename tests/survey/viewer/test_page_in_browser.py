@@ -14,7 +14,7 @@ import pytest
 from aquaflow.config.service import ViewerConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
+from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.finished import open_dive
 from aquaflow.survey.viewer.levels import RANGE, range_level
 from aquaflow.survey.viewer.page import ViewerPage

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.measure.scale import Scale
+from aquaflow.survey.measure.quantity import Scale
 from aquaflow.survey.viewer.measuring import LengthUnit, MeasuringScene, measure, ray_of
 from aquaflow.survey.viewer.picking import pick, within_reach
 from aquaflow.telemetry.world_frame import WorldFrame

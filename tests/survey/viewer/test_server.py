@@ -17,8 +17,7 @@ from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.service import ViewerConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.page import ViewerPage
-from aquaflow.survey.viewer.server import MOST_BYTES
+from aquaflow.survey.viewer.page import MOST_BYTES, ViewerPage
 from tests.survey.viewer.planes import floor
 
 TOKEN = "correct-horse-battery"

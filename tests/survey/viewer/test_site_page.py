@@ -16,13 +16,12 @@ from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.merged_file import NAME as MERGED
-from aquaflow.survey.site.merging import merge
+from aquaflow.survey.site.merging import add_to_site, merge
 from aquaflow.survey.viewer.finished import finished_dive
 from aquaflow.survey.viewer.levels import RANGE
 from aquaflow.survey.viewer.moments import PICTURE
-from aquaflow.survey.viewer.packed_file import NAME as PACKED
+from aquaflow.survey.viewer.packing import NAME as PACKED
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.site_dives import read_shown
 from aquaflow.survey.viewer.site_page import DIVE, map_of_site, open_site

@@ -18,16 +18,14 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
 from aquaflow.dive.png import encoded_png
 from aquaflow.dive.point_cloud import read_posed_views
-from aquaflow.survey.export.mesh.atlas import lay_out, paint
+from aquaflow.survey.export.mesh.atlas import batches, lay_out, look_at, paint, shown_colours
 from aquaflow.survey.export.mesh.blocks import Blocks
-from aquaflow.survey.export.mesh.colouring import batches, look_at, shown_colours
-from aquaflow.survey.export.mesh.fusion import fuse
 from aquaflow.survey.export.mesh.glb import write_glb
 from aquaflow.survey.export.mesh.placed_mesh import PlacedMesh, Texture
-from aquaflow.survey.export.mesh.surface import SurfaceBuilder, require_marching_cubes
+from aquaflow.survey.export.mesh.surface import SurfaceBuilder, fuse, require_marching_cubes
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
-from aquaflow.survey.export.ortho.colours import Colours
+from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.export.ortho.grid import round_to_digits
 
 Array = npt.NDArray[np.float64]
@@ -74,7 +72,7 @@ class FusedSurface:
 
     mesh: TriangleMesh
     sigma: Array
-    """[N] of the vertices: :class:`aquaflow.survey.export.mesh.colouring.ObservedColours`."""
+    """[N] of the vertices: :class:`aquaflow.survey.export.mesh.atlas.ObservedColours`."""
     views: ViewSurfaces
     voxel: float
     """Side of a voxel."""

@@ -38,7 +38,7 @@ class PlacedMesh:
     faces: Integers
     """[M, 3] counter-clockwise seen from outside."""
     sigma: Array
-    """[N] as in :class:`aquaflow.survey.export.mesh.colouring.ObservedColours`."""
+    """[N] as in :class:`aquaflow.survey.export.mesh.atlas.ObservedColours`."""
     origin: tuple[float, float, float]
     """To be added to the positions; zeros without a grid."""
     where: Placement

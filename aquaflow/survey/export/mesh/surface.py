@@ -8,15 +8,16 @@ hole stays a hole.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors.extra import load
-from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Chunk
-from aquaflow.survey.export.mesh.fusion import ChunkDistances
+from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Chunk, truncation
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
+from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, SIGMA, ViewSurfaces
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -113,3 +114,104 @@ def _edges(
     own = between.sum(axis=1) != 1
     axis[own] = 3 + np.flatnonzero(own)
     return np.column_stack([lower.astype(np.int64) + corner, axis])
+
+
+# --------------------------------------------------------------------------------------------------
+# Ranges of all views, fused: the signed distance of voxels from the surface.
+#
+# B. Curless, M. Levoy, "A Volumetric Method for Building Complex Models from Range Images" (1996):
+# every view says how far a voxel lies before the surface that it shows along its ray, cut off at a
+# truncation; the weighted mean is zero on the surface. Here distances are across the surface and
+# not along the ray, the truncation follows from the range's own sigma, and so does the weight. What
+# lies further before the surface is free, and counts as such: haze between camera and ground is
+# taken away by the views that look through it.
+
+SLICE = 1 << 17
+"""Voxels worked on at a time: 20 MB."""
+LEAST_SHIFT = 1e-3
+"""Voxels: distances nearer to 0 are moved to it, so that no vertex falls on a voxel."""
+
+
+@dataclass(frozen=True)
+class ChunkDistances:
+    """The voxels of a chunk."""
+
+    values: Array
+    """[M] distance from the surface in voxels, positive where the cameras are; NaN of a voxel that
+    too few views say anything of."""
+
+
+def fuse(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) -> ChunkDistances:
+    """Distances of ``chunk.voxels()``, each known to ``least_views`` views at least."""
+    voxels = chunk.voxels()
+    low, high = voxels.min(axis=0) * voxel, voxels.max(axis=0) * voxel
+    numbers = surfaces.around(low, high)
+    places = voxels.astype(np.float64) * voxel
+    parts = (places[first : first + SLICE] for first in range(0, len(places), SLICE))
+    found = [_fused_slice(surfaces, numbers, part, voxel, least_views) for part in parts]
+    return ChunkDistances(np.concatenate(found))
+
+
+def _fused_slice(
+    surfaces: ViewSurfaces,
+    numbers: list[int],
+    places: Array,  # [M, 3] of voxels
+    voxel: float,
+    least_views: int,
+) -> Array:
+    """[M] as in Distances."""
+    total, weights = np.zeros(len(places)), np.zeros(len(places))
+    near = np.zeros(len(places), np.int32)
+    for number in numbers:
+        which, distance, reach, weight = _seen_by(surfaces, number, places, voxel)
+        total[which] += weight * np.minimum(distance, reach)
+        weights[which] += weight
+        near[which] += distance <= reach
+    known = near >= least_views
+    values = np.full(len(places), np.nan)
+    values[known] = total[known] / (weights[known] * voxel)
+    tiny = np.abs(values) < LEAST_SHIFT
+    values[tiny] = np.where(values[tiny] < 0.0, -LEAST_SHIFT, LEAST_SHIFT)
+    return values
+
+
+def _seen_by(
+    surfaces: ViewSurfaces,
+    number: int,
+    places: Array,  # [M, 3]
+    voxel: float,
+) -> tuple[npt.NDArray[np.intp], Array, Array, Array]:
+    """Of the places [K] that a view says anything of: numbers, distances from its surface,
+    truncations, and weights."""
+    view, layers = surfaces.views[number], surfaces.surface(number)
+    camera = view.camera
+    local = (places - view.T_uc.t) @ view.T_uc.R
+    which = np.flatnonzero(local[:, 2] > voxel)
+    local = local[which]
+    u, v = camera.project(local).T - 0.5
+    # Four pixels around each, of which the last row and column have none further on.
+    inside = (u >= 0.0) & (u < camera.width - 1) & (v >= 0.0) & (v < camera.height - 1)
+    which, local, u, v = which[inside], local[inside], u[inside], v[inside]
+    column, row = u.astype(np.intp), v.astype(np.intp)
+    ranges = _between(layers[RANGE], row, column, v - row, u - column)
+    nearest = (v + 0.5).astype(np.intp), (u + 0.5).astype(np.intp)
+    cosine, sigma = layers[COSINE][nearest], layers[SIGMA][nearest]
+    distance = (ranges - np.linalg.norm(local, axis=1)) * cosine
+    reach = truncation(sigma, voxel)
+    with np.errstate(invalid="ignore"):
+        told = (distance >= -reach) & (ranges < surfaces.far) & np.isfinite(cosine)
+    weight = cosine[told] / sigma[told].astype(np.float64) ** 2
+    return which[told], distance[told], reach[told], weight
+
+
+def _between(
+    layer: npt.NDArray[np.float32],  # [H, W]
+    row: npt.NDArray[np.intp],  # [K]
+    column: npt.NDArray[np.intp],  # [K]
+    down: Array,  # [K] in [0, 1), from the row on
+    right: Array,  # [K] in [0, 1), from the column on
+) -> Array:
+    """[K] bilinear; NaN where one of the four pixels is."""
+    top = layer[row, column] * (1.0 - right) + layer[row, column + 1] * right
+    bottom = layer[row + 1, column] * (1.0 - right) + layer[row + 1, column + 1] * right
+    return np.asarray(top * (1.0 - down) + bottom * down)

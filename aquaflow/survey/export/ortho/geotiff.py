@@ -16,9 +16,8 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError, first_line
 from aquaflow.base.errors.extra import load
 from aquaflow.base.storage.atomic import fresh_file, scratch_file
-from aquaflow.survey.export.ortho.grid import TILE_PX, Grid, GridTile
+from aquaflow.survey.export.ortho.grid import NODATA, TILE_PX, Grid, GridTile, RasterFile
 from aquaflow.survey.export.ortho.ground import Ground
-from aquaflow.survey.export.ortho.layers import NODATA, RasterFile
 
 CACHE_MB = 64
 """GDAL's cache of blocks; it takes a twentieth of the memory otherwise."""
