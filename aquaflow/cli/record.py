@@ -70,7 +70,7 @@ def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
 
 def _devices(vehicle: VehicleConfig) -> Callable[[RecordingSession], None]:
     """Open the cameras; links are opened with the recorder, which gets their first byte."""
-    from aquaflow.live.mounting import record_mountings
+    from aquaflow.live.feed import record_mountings
     from aquaflow.sources import open_camera, open_links
 
     cameras = {name: open_camera(name, config) for name, config in vehicle.cameras.items()}

@@ -76,7 +76,7 @@ def run(
     from aquaflow.base.errors import InputError
     from aquaflow.config.vehicle import load_vehicle, looking_in
     from aquaflow.geometry.camera import load_camera
-    from aquaflow.live.sources import devices, recording
+    from aquaflow.live.onboard import devices, recording
 
     vehicle = load_vehicle(config, preset)
     if in_site is not None:
@@ -235,8 +235,7 @@ def map_realtime(
 ) -> Finished | None:
     """``map --realtime``: a recording through the live loop, refined as a replay is."""
     from aquaflow.config.vehicle import VehicleConfig
-    from aquaflow.live.onboard import map_live
-    from aquaflow.live.sources import recording
+    from aquaflow.live.onboard import map_live, recording
 
     alone = VehicleConfig().service.model_dump()
     alone["dive"]["site"] = in_site

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from functools import partial
+from pathlib import Path
 
 from aquaflow.base.errors import AquaFlowError
+from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Stages
-from aquaflow.base.storage.dive_status import DiveStatus, read_status
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
 from aquaflow.base.worker import Worker, core_count
 from aquaflow.config import Config, parse_config
 from aquaflow.config.stage import MountingConfig
@@ -18,27 +23,71 @@ from aquaflow.dive.run import DiveRun
 from aquaflow.live.checkpoint.base import localise_in_base
 from aquaflow.live.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.live.checkpoint.generations import Checkpoint
-from aquaflow.live.checkpoint.repair import lost_with_their_files
+from aquaflow.live.checkpoint.repair import hear_again, lost_with_their_files
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.checkpoint.telemetry import hear_again
+from aquaflow.live.clock_reading import ClockReading, Continued
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.deliverable_updates import DeliverableUpdater
-from aquaflow.live.device_errors import DeviceErrors
-from aquaflow.live.dive_clock import Continued
-from aquaflow.live.dive_status_file import DiveStatusFile
-from aquaflow.live.feed import Feed
+from aquaflow.live.feed import Feed, camera_mounting
+from aquaflow.live.health.exposition import DROPPED, ERRORS
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.pressure import PressureReader
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.mounting import camera_mounting
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
 from aquaflow.slam.map_inputs import make_maps
+from aquaflow.sources.newest import OLDEST_NS
 from aquaflow.types import Dropped
+
+# --------------------------------------------------------------------------------------------------
+# What devices lost or sent in vain, summed up in log.jsonl once a minute.
+
+EVERY_S = 60.0
+"""Period of the summaries: a device that fails for an hour takes 60 lines."""
+
+Devices = Mapping[str, Mapping[str, object]]
+
+
+class DeviceErrors:
+    """Compares the counters of the devices with those of the summary before."""
+
+    def __init__(
+        self, describe: Callable[[], Devices], now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._describe, self._now_s = describe, now_s
+        self._before: dict[str, dict[str, int]] = {}
+        self._since_s = now_s()
+
+    def update(self) -> None:
+        """To be called often; tells what went wrong once a minute."""
+        if self._now_s() - self._since_s >= EVERY_S:
+            self.tell()
+
+    def tell(self) -> None:
+        """A line for each device that counted something since the last."""
+        took_s, self._since_s = self._now_s() - self._since_s, self._now_s()
+        for name, device in self._describe().items():
+            counts = {
+                key: value
+                for key in (*DROPPED, *ERRORS)
+                if isinstance(value := device.get(key), int)
+            }
+            before, self._before[name] = self._before.get(name, {}), counts
+            grown = {key: counts[key] - before.get(key, 0) for key in counts}
+            grown = {key: count for key, count in grown.items() if count > 0}
+            if grown:
+                self._log(name, grown, took_s)
+
+    @staticmethod
+    def _log(name: str, grown: dict[str, int], took_s: float) -> None:
+        words = ", ".join(f"{count} {key.replace('_', ' ')}" for key, count in grown.items())
+        fields = {"event": "errors", "source": name, "counts": grown}
+        log.warning("%s: in %.0f s %s", name, took_s, words, extra={"fields": fields})
+
 
 log = logging.getLogger(__name__)
 
@@ -178,3 +227,55 @@ def plain(vehicle: VehicleConfig) -> Config:
     if optimiser["refine_seconds"] is None:
         optimiser["refine_seconds"] = vehicle.service.mapping.refine_seconds
     return parse_config(settings, "config")
+
+
+# --------------------------------------------------------------------------------------------------
+# How a live dive stands, in its dive.json: written when that changes.
+
+
+class DiveStatusFile:
+    """A watcher of the loop: the pilot pauses the dive, and goes on with it."""
+
+    def __init__(
+        self,
+        dive: Path,
+        failures: Failures,
+        mounting: MountingConfig | None,
+        before: DiveStatus | None,
+        paused: Callable[[], None] = lambda: None,
+    ) -> None:
+        """``before``: of a dive that goes on; ``paused``: called when the pilot pauses it."""
+        self._dive, self._failures, self._paused = dive, failures, paused
+        begun_utc = _utc(time.time_ns()) if before is None else before.begun_utc
+        stated = None if mounting is None else mounting.model_dump(mode="json")
+        self.was_paused = before is not None and before.paused
+        """The pilot paused it in a process before."""
+        boot = ClockReading.now().boot
+        self.status = DiveStatus(DiveState.OPEN, self.was_paused, begun_utc, boot, stated)
+        self._write()
+
+    def update(self, loop: LiveLoop) -> None:
+        """Called after every turn of the loop."""
+        paused = loop.control.paused
+        if paused is not self.status.paused:
+            self.status = replace(self.status, paused=paused)
+            self._write()
+            if paused:
+                self._paused()
+
+    def set(self, state: DiveState) -> None:
+        """The dive stands otherwise from here on."""
+        self.status = replace(self.status, state=state)
+        self._write()
+
+    def _write(self) -> None:
+        with self._failures.contain("writing dive.json", full_disk=True):
+            self.status.write(self._dive)
+
+
+def _utc(wall_ns: int) -> str | None:
+    """In ISO 8601; None of a clock that was never set."""
+    if wall_ns < OLDEST_NS:
+        return None
+    moment = datetime.fromtimestamp(wall_ns // 1_000_000_000, timezone.utc)
+    return moment.isoformat().replace("+00:00", "Z")

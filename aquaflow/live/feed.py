@@ -26,9 +26,11 @@ from typing import Protocol, runtime_checkable
 
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors.failures import Failures
-from aquaflow.config import SourceConfig
+from aquaflow.config import Config, SourceConfig
+from aquaflow.config.service import ServiceConfig
 from aquaflow.config.stage import MountingConfig
-from aquaflow.live.dive_clock import Continued
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.live.clock_reading import Continued
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples
 from aquaflow.recordings.playback import Event, Playback, delay_event
@@ -423,3 +425,32 @@ def _state_of(device: object) -> dict[str, object]:
     counters, flow = getattr(device, "counters", None), getattr(device, "flow", None)
     said |= {} if counters is None else vars(counters)
     return said | ({} if flow is None else flow.to_json())
+
+
+# --------------------------------------------------------------------------------------------------
+# How the mapping camera of a live dive sits in the vehicle, from whatever states it first.
+
+
+def camera_mounting(
+    config: Config, service: ServiceConfig, camera: object
+) -> MountingConfig | None:
+    """``fusion.camera``, else what ``camera`` (or its feed) states, else ``service.pose.mounting``
+    where poses are sent; None: unknown.
+
+    Raises:
+        InputError, ConfigError: the camera states one that cannot be read.
+    """
+    pose = service.pose
+    return config.fusion.camera or mounting_of(camera) or (pose.mounting if pose.enabled else None)
+
+
+def record_mountings(
+    recorder: Recorder, vehicle: VehicleConfig, cameras: Mapping[str, CameraSource]
+) -> None:
+    """State in a recording how the cameras sit, as far as the vehicle's configuration says it."""
+    mapped = vehicle.service.camera or next(iter(cameras), None)
+    for name, camera in cameras.items():
+        known = mounting_of(camera)
+        if name == mapped:
+            known = camera_mounting(vehicle, vehicle.service, camera)
+        recorder.record_mounting(name, known)

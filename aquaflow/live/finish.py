@@ -20,7 +20,7 @@ from aquaflow.dive.run import Finished
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.live.checkpoint.generations import generations
 from aquaflow.live.checkpoint.resume import Choice, newest_usable
-from aquaflow.live.dive_clock import Continued
+from aquaflow.live.clock_reading import Continued
 from aquaflow.live.feed import LatestSamples
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.mapping.work import Progress

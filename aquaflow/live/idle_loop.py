@@ -8,10 +8,9 @@ from collections.abc import Callable
 from aquaflow.base.stages import Profiler
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.counters import Counters
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
-from aquaflow.live.service_health import ServiceHealth
-from aquaflow.live.service_status import ServiceStatus
+from aquaflow.live.service_status import Counters, ServiceStatus
 from aquaflow.types import Frame
 
 STAGE = "standby"

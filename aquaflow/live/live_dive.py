@@ -19,9 +19,9 @@ from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import assemble, plain
 from aquaflow.live.feed import Feed
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import FINISHING
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import Progress
 from aquaflow.slam.slam import FinishTime
 

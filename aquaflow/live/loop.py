@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.config.service import ServiceConfig
+from aquaflow.base.errors.failures import Failures
+from aquaflow.config.service import LimitsConfig, ServiceConfig
 from aquaflow.dive.run import DiveRun
-from aquaflow.live import service_warnings
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.counters import Counters
-from aquaflow.live.health.degradation import DegradationLevel
+from aquaflow.live.health import state
+from aquaflow.live.health.degradation import Degradation, DegradationLevel
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.pressure import Need, Pressure, Shortage
-from aquaflow.live.health.state import Facts, Judgement, ServiceState, judge
+from aquaflow.live.health.state import Facts, Judgement, ServiceState, ServiceWarning, judge
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.service_health import ServiceHealth
+from aquaflow.live.service_status import Counters
+from aquaflow.tracking.consistency import InconsistentKeyframe
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped, Frame
 
@@ -233,15 +235,69 @@ class LiveLoop:
             self._now_s() - self._frame_s,
             PATIENCE_S,
             self._pictured,
-            service_warnings.silent_camera(devices),
+            silent_camera(devices),
             self._unposed < LOST_AFTER,
             self._ever_posed,
-            service_warnings.inconsistency(slam.tracker.monitor.trouble),
+            inconsistency(slam.tracker.monitor.trouble),
             [
-                *service_warnings.of_the_machine(
-                    self.degradation, self.pressure, self.config.limits
-                ),
-                *service_warnings.of_the_stages(self.maps, slam.failures),
-                *service_warnings.of_the_devices(devices),
+                *of_the_machine(self.degradation, self.pressure, self.config.limits),
+                *of_the_stages(self.maps, slam.failures),
+                *of_the_devices(devices),
             ],
         )
+
+
+# --------------------------------------------------------------------------------------------------
+# Why the service works with less than everything: for its page, and for the pilot.
+
+Devices = Mapping[str, Mapping[str, object]]
+
+
+def silent_camera(devices: Devices) -> ServiceWarning:
+    """Of the camera that maps, which is the first."""
+    for name, device in devices.items():
+        if device["kind"] == "camera":
+            return ServiceWarning(str(device["reason"]), state.no_picture(name))
+    return ServiceWarning("", state.OF_STATE[ServiceState.WAITING])
+
+
+def inconsistency(found: InconsistentKeyframe | None) -> ServiceWarning | None:
+    """Of a finding of the monitor of consistency."""
+    return None if found is None else ServiceWarning(str(found), state.OF_CAUSE[found.cause])
+
+
+def of_the_machine(
+    degradation: Degradation, pressure: Pressure, limits: LimitsConfig
+) -> list[ServiceWarning]:
+    """Of memory, heat and disk."""
+    troubles, level, need = [], degradation.level, degradation.need
+    if level is not DegradationLevel.FULL and need is not None:
+        sentence = state.doing_less(level, need.shortage)
+        troubles.append(ServiceWarning(f"{level.words}: {need.reason}", sentence))
+    if pressure.disk_is_full(limits):
+        full = f"disk full: {pressure.disk_free_mb:.0f} MB left"
+        troubles.append(ServiceWarning(full, state.DISK_FULL))
+    return troubles
+
+
+def of_the_stages(maps: MapThread, failures: Failures) -> list[ServiceWarning]:
+    """Of what raises again and again."""
+    troubles = []
+    if maps.failing:
+        troubles.append(ServiceWarning(f"mapping fails: {maps.last_failure}", state.MAPPING_FAILS))
+    troubles += [ServiceWarning(each, state.STAGE_FAILS) for each in failures.list_repeated()]
+    return troubles
+
+
+def of_the_devices(devices: Devices) -> list[ServiceWarning]:
+    """Of links that are silent, and a recorder that ended."""
+    troubles = []
+    for name, device in devices.items():
+        if device["kind"] == "link" and device["state"] != "connected":
+            reason = f"link '{name}': {device['reason'] or device['state']}"
+            lost = device["state"] == "lost"
+            troubles.append(ServiceWarning(reason, state.silent_link(name, lost)))
+        if device["kind"] == "recorder" and device["state"] != "recording":
+            reason = f"not recording: {device['reason']}"
+            troubles.append(ServiceWarning(reason, state.NOT_RECORDING))
+    return troubles

@@ -19,10 +19,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
+
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.live.half_size import halve
+from aquaflow.keyframes import Pointmap
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.mapping.work import Growth, Insertion, OwnedMaps, Progress
@@ -312,3 +315,41 @@ def _is_mapped(insertion: Insertion, maps: OwnedMaps) -> bool:
 def _insert(insertion: Insertion, maps: OwnedMaps) -> None:
     if _is_mapped(insertion, maps):
         maps.insert(insertion)
+
+
+# --------------------------------------------------------------------------------------------------
+# New views of the map at half the width: a quarter of the pixels to keep and to draw.
+
+
+def halve(growth: Growth) -> Growth:
+    """The same growth at half the picture width."""
+    view = growth.view
+    width, height = view.camera.width // 2, view.camera.height // 2
+    small = view.with_pixels(
+        _picture(view, width, height),
+        view.camera.scaled(width, height),
+        None if view.mask is None else view.mask[1 : 2 * height : 2, 1 : 2 * width : 2].copy(),
+    )
+    pointmap = growth.pointmap
+    if pointmap is not None:
+        pointmap = _pointmap(pointmap, small)
+    return replace(growth, view=small, pointmap=pointmap)
+
+
+def _picture(view: View, width: int, height: int) -> npt.NDArray[np.uint8]:
+    import cv2
+
+    whole = view.image[: 2 * height, : 2 * width]
+    small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8)
+
+
+def _pointmap(pointmap: Pointmap, small: View) -> Pointmap:
+    rows = slice(1, 2 * small.camera.height, 2)
+    columns = slice(1, 2 * small.camera.width, 2)
+    rho, variance = pointmap.rho[rows, columns], pointmap.variance[rows, columns]
+    learned = pointmap.learned
+    if learned is not None:
+        half_rho, half_variance = learned.rho[rows, columns], learned.variance[rows, columns]
+        learned = replace(learned, rho=half_rho, variance=half_variance)
+    return Pointmap(small.camera, rho.copy(), variance.copy(), learned=learned)

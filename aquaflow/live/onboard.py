@@ -5,29 +5,37 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.base.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError, ConfigError
+from aquaflow.base.errors.failures import Failures
 from aquaflow.base.storage.dive_status import DiveState, read_status
 from aquaflow.base.worker import stop_on_signals
+from aquaflow.config.instruments import DbcConfig
+from aquaflow.config.telemetry import AnyDevice, MavlinkConfig
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive.log import EarlyRecords
 from aquaflow.dive.run import Finished
 from aquaflow.live.checkpoint.checkpoint import UnusableStateError
+from aquaflow.live.checkpoint.generations import SetAside
 from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resume_folder, tidy
-from aquaflow.live.checkpoint.set_aside import SetAside
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
-from aquaflow.live.feed import Feed
+from aquaflow.live.feed import Feed, LiveFeed, PlaybackFeed, record_mountings
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import FINISHING, IDLE
 from aquaflow.live.live_dive import LiveDive
+from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.service_frontends import ServiceFrontends
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.live.vehicle.arming import refuse_without_autopilot
-from aquaflow.live.vehicle.scale_sources import refuse_without_scale
 from aquaflow.mapping.work import Progress
+from aquaflow.recordings.playback import Playback
+from aquaflow.sources import open_camera, open_links, open_recording, telemetry_reader
+from aquaflow.types import CameraModel
 
 log = logging.getLogger(__name__)
 
@@ -226,3 +234,90 @@ def _stop_after(seconds: float | None, control: ServiceControl) -> threading.Tim
     if seconds is not None:
         timer.start()
     return timer
+
+
+# --------------------------------------------------------------------------------------------------
+# Whether anything that is configured can give the map metres.
+
+METRIC_SAMPLES = {"depth", "velocity", "altitude"}
+"""Samples of a DBC device that are lengths, or lengths per second."""
+METRIC_MESSAGES = {"LOCAL_POSITION_NED", "VFR_HUD", "DISTANCE_SENSOR"}
+"""Messages of an autopilot that hold a length, in addition to the external pressure."""
+
+
+def refuse_without_scale(vehicle: VehicleConfig) -> None:
+    """A service that shall send poses must have a source of metres.
+
+    Raises:
+        ConfigError: nothing that is configured can ever give the map's scale.
+    """
+    devices, fusion = vehicle.telemetry.devices.values(), vehicle.fusion
+    lengths = bool(fusion.boards) or fusion.lasers is not None
+    if fusion.enabled and (lengths or any(_is_metric(device) for device in devices)):
+        return
+    raise ConfigError(
+        "service.pose.enabled: nothing here can give the map's scale in metres, so that no pose "
+        "may steer the vehicle; set it to false, or add to telemetry.devices one that measures "
+        "depth, velocity or altitude, or set fusion.boards or fusion.lasers; with fusion.enabled"
+    )
+
+
+def _is_metric(device: AnyDevice) -> bool:
+    if isinstance(device, MavlinkConfig):
+        messages = METRIC_MESSAGES.intersection(device.messages)
+        return device.external_pressure is not None or bool(messages)
+    if isinstance(device, DbcConfig):
+        return any(signal.sample in METRIC_SAMPLES for signal in device.samples)
+    return True
+
+
+# --------------------------------------------------------------------------------------------------
+# The feed that a config or a path describes.
+
+
+def devices(vehicle: VehicleConfig) -> LiveFeed:
+    """The vehicle's cameras and links, with a recorder if ``service.record`` is set. A camera that
+    is not there yet is waited for.
+
+    Raises:
+        ConfigError: ``service.camera`` names none of the cameras.
+        InputError: a driver or the library that it needs is not installed.
+    """
+    EarlyRecords().attach()  # links are opened before the dive has a folder
+    name = vehicle.service.camera or next(iter(vehicle.cameras))
+    if name not in vehicle.cameras:
+        known = ", ".join(vehicle.cameras)
+        raise ConfigError(f"service.camera is '{name}'; the cameras are: {known}")
+    cameras = {key: open_camera(key, config) for key, config in vehicle.cameras.items()}
+    recorder = _recorder(vehicle) if vehicle.service.record else None
+    if recorder is not None:
+        record_mountings(recorder, vehicle, cameras)
+    tap = None if recorder is None else recorder.raw
+    links = open_links(vehicle.telemetry, tap) if vehicle.telemetry.devices else None
+    return LiveFeed(name, cameras, links, vehicle.source, recorder)
+
+
+def _recorder(vehicle: VehicleConfig) -> Recorder:
+    """One folder for each start of the service: a recording is never appended to."""
+    folder = vehicle.service.dives / time.strftime("recording-%Y%m%d-%H%M%S")
+    return Recorder(folder, vehicle.recording)
+
+
+def recording(
+    path: Path,
+    vehicle: VehicleConfig,
+    speed: float = 1.0,
+    calibration: CameraModel | None = None,
+) -> PlaybackFeed:
+    """The recording at ``path``, played back in real time, ``speed`` times as fast.
+
+    Raises:
+        InputError: nothing is there, or no installed source reads it.
+    """
+    camera = open_recording(path, fps=vehicle.source.fps)
+    reader = telemetry_reader(path)
+    telemetry = [] if reader is None else [reader.open(path)]
+    failures = Failures()
+    playback = Playback(camera, telemetry, speed, failures=failures)
+    known = calibration or camera.camera
+    return PlaybackFeed(playback, vehicle.source, known, camera.name_of, camera.notes, failures)

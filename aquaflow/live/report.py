@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import resource
 import time
+from collections.abc import Iterable
 from dataclasses import asdict
+from datetime import datetime, timezone
 from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from aquaflow import __version__
 from aquaflow.config.service import ViewerConfig
@@ -13,11 +18,12 @@ from aquaflow.dive.placement import in_site_numbers
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
-from aquaflow.live.health.telemetry import metric_frame_numbers, newest_values
 from aquaflow.live.idle_loop import IdleLoop
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.live.vehicle.pose_output import PoseOutput
+from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.types import KIND_OF, VALUES, Attitude, Position, TelemetrySample, UtcTime
 
 GOOD = (
     ServiceState.TRACKING,
@@ -138,3 +144,75 @@ def viewer_facts(config: ViewerConfig) -> dict[str, Any] | None:
 
 def _peak_rss_mb() -> float:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+
+
+# --------------------------------------------------------------------------------------------------
+# What every source of telemetry measures now, and what is known of the map's metric frame.
+
+UNITS = {
+    "depth": "m",
+    "attitude": "deg roll, pitch, heading",
+    "angular_rate": "rad/s",
+    "acceleration": "m/s^2",
+    "velocity": "m/s",
+    "altitude": "m",
+    "lights": "of 1",
+    "position": "deg latitude, longitude",
+    "utc_time": "UTC",
+}
+"""Unit of the value of each kind of sample."""
+DIGITS, PLACE_DIGITS = 3, 7
+"""Decimals shown; a degree of latitude has 111 km."""
+
+
+def newest_values(
+    latest: Iterable[tuple[TelemetrySample, float]],
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """By source and kind: ``value`` (a number, a list or a text), ``unit`` and ``age_s``.
+
+    ``latest``: the newest sample of each source and kind, and the seconds since it came.
+    """
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for sample, age_s in sorted(latest, key=lambda each: each[0].source):
+        kind = KIND_OF[type(sample)]
+        said = {"value": _value(sample), "unit": UNITS[kind], "age_s": round(age_s, 1)}
+        found.setdefault(sample.source, {})[kind] = said
+    return found
+
+
+def _value(sample: TelemetrySample) -> float | list[float] | str:
+    if isinstance(sample, UtcTime):
+        moment = datetime.fromtimestamp(sample.utc_ns * 1e-9, timezone.utc)
+        return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    if isinstance(sample, Attitude):
+        R = Rotation.from_quat(np.roll(sample.wxyz, -1))
+        yaw, pitch, roll = R.as_euler("ZYX", degrees=True)
+        return [round(float(angle), DIGITS) for angle in (roll, pitch, yaw % 360.0)]
+    if isinstance(sample, Position):
+        return [round(each, PLACE_DIGITS) for each in (sample.latitude_deg, sample.longitude_deg)]
+    value = getattr(sample, VALUES[type(sample)][0])
+    if isinstance(value, tuple):
+        return [round(each, DIGITS) for each in value]
+    return round(float(value), DIGITS)
+
+
+def metric_frame_numbers(frame: WorldFrame) -> dict[str, Any]:
+    """Whether scale, gravity and north are known, how well, and why sources are not used."""
+    return {
+        "metric": frame.metric,
+        "metres_per_map_unit": round(frame.T_nm.scale, 5) if frame.metric else None,
+        "scale_sigma": round(frame.scale_sigma, 5) if frame.metric else None,
+        "scale_source": frame.scale_source,
+        "clock_offset_s": round(frame.clock_offset_s, DIGITS),
+        "level": frame.level,
+        "gravity_sigma_deg": (
+            round(float(np.degrees(frame.tilt_sigma_rad)), DIGITS) if frame.level else None
+        ),
+        "north": frame.north,
+        "sources": {
+            f"{source.source} {source.kind}": {
+                "used": source.used, "rejected": source.rejected, "reason": source.reason,
+            }
+            for source in frame.sources
+        },
+    }  # fmt: skip

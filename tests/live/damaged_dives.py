@@ -22,7 +22,7 @@ from aquaflow.dive.run import Finished
 from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.live.checkpoint.generations import STATE, Checkpoint
 from aquaflow.live.checkpoint.resume import newest_usable
-from aquaflow.live.dive_clock import Continued
+from aquaflow.live.clock_reading import Continued
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.onboard import OnboardSettings, begin_dive
 from aquaflow.sources import open_recording

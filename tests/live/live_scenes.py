@@ -19,16 +19,16 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.live.clock_reading import Continued
 from aquaflow.live.control import ServiceControl
-from aquaflow.live.dive_clock import Continued
 from aquaflow.live.feed import LatestSamples
 from aquaflow.live.health.degradation import Degradation
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.pressure import Pressure
 from aquaflow.live.health.state import Health
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.slam import Slam

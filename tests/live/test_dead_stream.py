@@ -16,9 +16,9 @@ from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.stream import StreamCamera
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import LiveFeed
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.loop import PATIENCE_S, LiveLoop
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.sim_drivers.camera_feed import CameraFeed
 from aquaflow.sim_drivers.rtp_camera import RtpCamera, RtspCamera
 from tests.drivers.camera_scenes import Pictures, free_port

@@ -9,8 +9,8 @@ import pytest
 
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.live import CameraCounters
-from aquaflow.live.device_errors import EVERY_S, DeviceErrors
-from aquaflow.live.health import device_counters as tables
+from aquaflow.live.dive_parts import EVERY_S, DeviceErrors
+from aquaflow.live.health import exposition as tables
 
 
 def test_every_counter_of_a_driver_is_in_one_table() -> None:

@@ -19,9 +19,9 @@ from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.transport import opener
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.live.dive_clock import Continued
+from aquaflow.live.clock_reading import Continued
 from aquaflow.live.feed import LiveFeed, PlaybackFeed
-from aquaflow.live.health.prometheus_devices import device_lines
+from aquaflow.live.health.exposition import device_lines
 from aquaflow.recordings.playback import Playback
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
 from aquaflow.sim_drivers.devices.ardusub import ArduSub

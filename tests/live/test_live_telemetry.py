@@ -16,9 +16,9 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.alignment import align
 from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.live.checkpoint.generations import SetAside
+from aquaflow.live.checkpoint.repair import cut_at_checkpoint
 from aquaflow.live.checkpoint.resume import resume_folder
-from aquaflow.live.checkpoint.set_aside import SetAside
-from aquaflow.live.checkpoint.telemetry import cut_at_checkpoint
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.recordings.playback import Event, Playback

@@ -9,8 +9,8 @@ import pytest
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.checkpoint.resume import Choice
+from aquaflow.live.feed import camera_mounting
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.mounting import camera_mounting
 from tests.live.live_scenes import ToldFeed
 
 FUSION, OWN, POSE = (MountingConfig(yaw_deg=angle) for angle in (10.0, 20.0, 30.0))

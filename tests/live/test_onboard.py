@@ -19,10 +19,10 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live import onboard as module
 from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.live_dive import STAGE
 from aquaflow.live.onboard import Onboard, OnboardSettings, map_live
 from aquaflow.live.service_frontends import ServiceFrontends
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.live.service_status import ServiceStatus
 from tests.live.live_scenes import VEHICLE, ToldFeed
 from tests.live.unfinished_dives import unfinished

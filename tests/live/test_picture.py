@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.live.picture import SPACING_S, WIDTH, NewestPicture
+from aquaflow.live.service_frontends import SPACING_S, WIDTH, NewestPicture
 from aquaflow.types import Frame
 from tests.live.live_scenes import Clock
 

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import RecordingConfig
 from aquaflow.lab.synthetic.telemetry import HEADER
-from aquaflow.live.recorder.pictures import encode
+from aquaflow.live.recorder.writing import encode
 from aquaflow.recordings.csv_telemetry import CsvTelemetry
 from aquaflow.recordings.dataflash import Dataflash
 from aquaflow.recordings.mcap_camera import OURS, McapCamera

@@ -23,7 +23,7 @@ from aquaflow.config.service import RecordingConfig
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.recorder import Recorder
-from aquaflow.live.recorder.pictures import encode
+from aquaflow.live.recorder.writing import encode
 from aquaflow.recordings import mcap_messages
 from aquaflow.recordings.h264 import is_key
 from aquaflow.recordings.mcap_camera import McapCamera

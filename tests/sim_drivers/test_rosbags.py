@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import RecordingConfig
-from aquaflow.live.recorder.pictures import encode
+from aquaflow.live.recorder.writing import encode
 from aquaflow.recordings.rosbag import messages_in
 from aquaflow.recordings.rosbag_camera import RosbagCamera
 from aquaflow.sources import open_recorded_telemetry, open_recording

@@ -12,11 +12,9 @@ from urllib.parse import parse_qs
 
 from aquaflow import __version__
 from aquaflow.config.service import ListenConfig
-from aquaflow.live.control import ServiceControl
-from aquaflow.live.health.exposition import TYPE, head, label, sample
+from aquaflow.live.control import RefusedError, ServiceControl, ServiceRequest
+from aquaflow.live.health.exposition import TYPE, device_lines, head, label, sample
 from aquaflow.live.health.page import page_file
-from aquaflow.live.health.pilot_requests import MOST_BYTES, answer
-from aquaflow.live.health.prometheus_devices import device_lines
 from aquaflow.live.health.state import ServiceState
 from aquaflow.web import HttpRequest, HttpResponse, WebServer
 from aquaflow.web.access import GUESSES_S, Access, name_of, path_of
@@ -280,3 +278,40 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         "stage_share", "stage", report["stage_shares"], "Seconds per second in a stage.", "gauge"
     )
     yield from device_lines(report["devices"])
+
+
+# --------------------------------------------------------------------------------------------------
+# POST /dive/start, stop, finish and new: what a pilot asks for over HTTP, and the answers.
+
+PATHS = {f"/dive/{request.value}": request for request in ServiceRequest}
+"""The address of each request."""
+MOST_BYTES = 4096
+"""Of a request's body, which means nothing and is read only to be rid of it."""
+
+REQUEST_NOT_ALLOWED = {
+    "error": "give the token in a header or from the service's own page; a link to another page, "
+    "and an address with a token, do not do"
+}
+"""Answer to who may not ask."""
+
+
+def answer(
+    control: ServiceControl,
+    access: Access,
+    target: str,
+    headers: Mapping[str, str],
+    dive: str | None,
+    peer: str = "",
+) -> tuple[int, dict[str, Any]]:
+    """Status and JSON of the answer to a POST; ``headers`` by lower-case name, ``dive``: the
+    present one's name, ``peer``: the address that the request comes from."""
+    request = PATHS.get(path_of(target) or "")
+    if request is None:
+        return HTTPStatus.NOT_FOUND, {"error": "there is nothing here"}
+    if not access.may_change(headers, peer):
+        return HTTPStatus.FORBIDDEN, REQUEST_NOT_ALLOWED
+    try:
+        phase = control.ask(request)
+    except RefusedError as refused:
+        return HTTPStatus.CONFLICT, {"error": str(refused)}
+    return HTTPStatus.ACCEPTED, {"state": phase.value, "dive": dive}

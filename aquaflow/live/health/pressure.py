@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from aquaflow.config.service import LimitsConfig
-from aquaflow.live.recorder.disk import free_bytes
+from aquaflow.live.recorder.recorder import free_bytes
 
 MB = 1_000_000
 """Bytes of a megabyte, the unit of the settings."""

@@ -9,6 +9,7 @@ publish time the moment of exposure or measurement, both CLOCK_MONOTONIC.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -17,18 +18,27 @@ from pathlib import Path
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import RecordingConfig
 from aquaflow.config.stage import MountingConfig
-from aquaflow.live.recorder.disk import free_bytes
 from aquaflow.live.recorder.status import RecorderStatus
-from aquaflow.live.recorder.write_queue import (
+from aquaflow.live.recorder.writing import (
+    DiveWriter,
     Item,
     LinkBytes,
     QueuedPicture,
     QueuedSample,
     WriteQueue,
 )
-from aquaflow.live.recorder.writing import DiveWriter
 from aquaflow.recordings.dive_file import require_mcap
 from aquaflow.types import Dropped, Frame, TelemetrySample
+
+# --------------------------------------------------------------------------------------------------
+# Room on a disk.
+
+
+def free_bytes(folder: Path) -> int:
+    """What a user without privileges may still write to the disk of ``folder``."""
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize
+
 
 log = logging.getLogger(__name__)
 

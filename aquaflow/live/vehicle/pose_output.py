@@ -22,8 +22,7 @@ from aquaflow.config.service import PoseConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.feed import Feed
 from aquaflow.live.loop import LiveLoop
-from aquaflow.live.vehicle.body_geometry import body_pose, pose_covariance
-from aquaflow.live.vehicle.body_track import BodyTrack, Sighting
+from aquaflow.live.vehicle.body_track import BodyTrack, Sighting, body_pose, pose_covariance
 from aquaflow.sources.outbound import BodyPose, BodyPoseChange, OutboundMessage
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.world_frame import WorldFrame

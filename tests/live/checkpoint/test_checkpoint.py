@@ -20,8 +20,7 @@ from aquaflow.dive.ply import read_ply
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from aquaflow.live.checkpoint.resume import choose, is_begun, resume_folder
-from aquaflow.live.clock_reading import ClockReading
-from aquaflow.live.dive_clock import Continued
+from aquaflow.live.clock_reading import ClockReading, Continued
 from aquaflow.live.health.http import exposition
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report

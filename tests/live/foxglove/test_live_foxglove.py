@@ -34,10 +34,10 @@ from aquaflow.live.control import ServiceControl
 from aquaflow.live.foxglove.live import LiveFoxglove
 from aquaflow.live.foxglove.map_moment import cloud_of, take_map_moment
 from aquaflow.live.foxglove.server import BACKLOG, FoxgloveServer
+from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
 from aquaflow.live.service_frontends import ServiceFrontends
-from aquaflow.live.service_health import ServiceHealth
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame
 from tests.dive.ros.published import HASHES, hash_of

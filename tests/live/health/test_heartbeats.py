@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.live.health.heartbeats import Heartbeats, Watchdog
-from aquaflow.live.health.systemd import Notifier
+from aquaflow.live.health.heartbeats import Heartbeats, Notifier, Watchdog
 from tests.live.live_scenes import Clock, Told
 
 

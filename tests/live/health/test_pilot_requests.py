@@ -11,8 +11,7 @@ import pytest
 
 from aquaflow.config.service import ListenConfig
 from aquaflow.live.control import DivePhase, ServiceControl
-from aquaflow.live.health.http import HealthServer
-from aquaflow.live.health.pilot_requests import MOST_BYTES
+from aquaflow.live.health.http import MOST_BYTES, HealthServer
 from tests.live.health.reports import REPORT
 
 TOKEN = "correct-horse-battery"

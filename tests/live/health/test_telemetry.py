@@ -7,9 +7,8 @@ from pathlib import Path
 
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.feed import LatestSamples
-from aquaflow.live.health.telemetry import metric_frame_numbers, newest_values
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.report import report
+from aquaflow.live.report import metric_frame_numbers, newest_values, report
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import (
     Acceleration,

@@ -18,8 +18,8 @@ from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.port import FlatPort
 from aquaflow.live.recorder import Recorder, RecorderStatus
-from aquaflow.live.recorder.pictures import encode
 from aquaflow.live.recorder.session import RecordingSession
+from aquaflow.live.recorder.writing import encode
 from aquaflow.recordings import dive_file
 from aquaflow.recordings.dive_file import DiveFile
 from aquaflow.recordings.mcap_camera import McapCamera

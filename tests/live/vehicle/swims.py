@@ -9,7 +9,7 @@ import numpy as np
 
 from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.live.vehicle.body_geometry import BodyPoseInWorld
+from aquaflow.live.vehicle.body_track import BodyPoseInWorld
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.world_frame import North, WorldFrame

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.service import VehicleReportConfig
-from aquaflow.live.vehicle.pilot_messages import REPEAT_S, PilotMessages
+from aquaflow.live.vehicle.arming import REPEAT_S, PilotMessages
 from aquaflow.survey.coverage.live_coverage import SENTENCES, Hint
 from tests.drivers.simulated_links import Running, mavlink_udp, motion, running, until
 from tests.live.live_scenes import Told

@@ -16,13 +16,12 @@ from aquaflow.config.service import PoseConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.dive_clock import Continued
+from aquaflow.live.clock_reading import Continued
 from aquaflow.live.health.http import exposition
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.onboard import map_live
+from aquaflow.live.onboard import map_live, refuse_without_scale
 from aquaflow.live.report import report
 from aquaflow.live.vehicle.pose_output import PoseOutput, Withheld
-from aquaflow.live.vehicle.scale_sources import refuse_without_scale
 from aquaflow.sources.outbound import BodyPose, BodyPoseChange
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import FrameClass, Tracked

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.live.health import sentences
+from aquaflow.live.health import state as sentences
 from aquaflow.live.health.degradation import DegradationLevel, deepest
 from aquaflow.live.health.pressure import Shortage
 from aquaflow.live.health.state import ServiceState
-from aquaflow.live.vehicle.pilot_messages import REPEAT_S, SEVERITY, SPACING_S, PilotMessages
+from aquaflow.live.vehicle.arming import REPEAT_S, SEVERITY, SPACING_S, PilotMessages
 from aquaflow.sources.outbound import LONGEST_TEXT, StatusText
 from aquaflow.survey.coverage.live_coverage import SENTENCES
 from aquaflow.tracking.consistency import Cause, InconsistentKeyframe

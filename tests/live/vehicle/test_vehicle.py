@@ -15,7 +15,7 @@ from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
 from aquaflow.drivers.protocol.mavlink_outbound import ARDUPILOT, MOST_CHUNKS
 from aquaflow.geometry.similarity import so3_exp
-from aquaflow.live.vehicle.pilot_messages import PilotMessages
+from aquaflow.live.vehicle.arming import PilotMessages
 from aquaflow.sources.outbound import (
     LONGEST_TEXT,
     BodyPose,
