@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, TypeAlias
 
+from aquaflow.base.clocks.device import ClockMapping
 from aquaflow.types import TelemetrySample
 
 MAX_READ_BYTES = 65_536
@@ -68,3 +69,54 @@ class LinkDecoder(Protocol):
     def feed(self, data: bytes, arrival_ns: int) -> list[TelemetrySample]:
         """Samples that ``data`` completes. Never raises for what the bytes hold."""
         ...
+
+
+# --------------------------------------------------------------------------------------------------
+# What happens to devices, as fields of log records: keys of log.jsonl (docs/formats.md#log).
+
+Event: TypeAlias = Literal[
+    "waiting",
+    "connected",
+    "format",
+    "lost",
+    "reconnected",
+    "late",
+    "failed",
+    "unheard",
+    "unused",
+    "refused",
+]
+"""``waiting``: not there, and looked for; ``late``: its pictures show the past; ``unheard``:
+another sender's message; ``unused``: what the settings, the device's or ours, make useless;
+``refused``: what the device was asked for."""
+
+
+def about(source: str, event: Event) -> dict[str, dict[str, str]]:
+    """``extra`` of a log record about the device ``source``."""
+    return {"fields": {"event": event, "source": source}}
+
+
+# --------------------------------------------------------------------------------------------------
+# Moments of measurement from a device's own stamps, never later or much earlier than arrival.
+
+MAX_AGE_NS = 2_000_000_000
+"""No link delays a message longer; an older stamp means that a clock was set."""
+
+
+class DeviceClock:
+    """One device's clock on CLOCK_MONOTONIC."""
+
+    def __init__(self, name: str) -> None:
+        self.mapping = ClockMapping(name)
+
+    def stamp(self, device_ns: int, arrival_ns: int) -> int:
+        """When something stamped ``device_ns`` was measured; learns from the message as well."""
+        self.mapping.add(device_ns, arrival_ns)
+        return self.moment(device_ns, arrival_ns)
+
+    def moment(self, device_ns: int, arrival_ns: int) -> int:
+        """The same of a stamp that may be old when it is sent, and so says nothing of the clock."""
+        t_ns = self.mapping.to_monotonic(device_ns)
+        if t_ns is None or not arrival_ns - MAX_AGE_NS <= t_ns <= arrival_ns:
+            return arrival_ns
+        return t_ns

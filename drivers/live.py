@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -16,9 +17,7 @@ from enum import Enum
 from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
-from aquaflow.drivers.events import Event, about
-from aquaflow.drivers.flow import DeviceState
-from aquaflow.drivers.sequence import SequenceGaps
+from aquaflow.drivers.link import Event, about
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.sources import is_asked
 from aquaflow.sources.newest import Newest
@@ -352,3 +351,86 @@ class ExposureClock:
 
 def _plausible(t_ns: int, arrival_ns: int) -> bool:
     return -MAX_FUTURE_NS <= arrival_ns - t_ns <= MAX_LATENCY_NS
+
+
+# --------------------------------------------------------------------------------------------------
+# How the data of one device flow: how many a second, how old the newest is, how late it came.
+
+WINDOW_S = 10
+"""Seconds over which rate and lag are taken: a fix each 5 s still has a rate."""
+SECOND_NS = 1_000_000_000
+
+
+class _Second:
+    """What came within one second."""
+
+    __slots__ = ("count", "lag_ns", "number")
+
+    def __init__(self, number: int) -> None:
+        self.number, self.count, self.lag_ns = number, 0, 0
+
+
+class DeviceState:
+    """Written by the device's thread, read by anyone."""
+
+    def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._now_ns = now_ns
+        self._newest_ns: int | None = None
+        self._first = 0
+        """The second in which the first one came."""
+        self._seconds: deque[_Second] = deque(maxlen=WINDOW_S + 1)
+
+    def record(self, measured_ns: int, arrival_ns: int) -> None:
+        """A picture or a sample; both moments are CLOCK_MONOTONIC."""
+        number = arrival_ns // SECOND_NS
+        if self._newest_ns is None:
+            self._first = number
+        self._newest_ns = arrival_ns
+        if not self._seconds or self._seconds[-1].number != number:
+            self._seconds.append(_Second(number))
+        second = self._seconds[-1]
+        second.count += 1
+        second.lag_ns += arrival_ns - measured_ns
+
+    def to_json(self) -> dict[str, float | None]:
+        """``rate_hz`` over the last whole seconds, ``age_s`` of the newest, and ``lag_ms``, the
+        mean time from measurement to arrival; None where nothing came."""
+        now_ns, newest_ns = self._now_ns(), self._newest_ns
+        if newest_ns is None:
+            return {"rate_hz": None, "age_s": None, "lag_ms": None}
+        number = now_ns // SECOND_NS
+        recent = [each for each in list(self._seconds) if number - each.number <= WINDOW_S]
+        whole = sum(each.count for each in recent if each.number < number)
+        count, lag_ns = sum(each.count for each in recent), sum(each.lag_ns for each in recent)
+        return {
+            "rate_hz": round(whole / min(WINDOW_S, max(1, number - self._first)), 2),
+            "age_s": round((now_ns - newest_ns) * 1e-9, 3),
+            "lag_ms": round(lag_ns * 1e-6 / count, 3) if count else None,
+        }
+
+
+# --------------------------------------------------------------------------------------------------
+# Pictures that a device counted and never delivered.
+
+SEQUENCE_BITS = 32
+"""Width of V4L2's counter, which then starts at 0; the OAK's is wider and never gets there."""
+
+MAX_GAP = 9000
+"""A larger gap (5 minutes at 30 pictures/s) is a counter that started anew, not a loss."""
+
+
+class SequenceGaps:
+    """Follows a device's counter while the device stays open."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+
+    def before(self, sequence: int | None) -> int | None:
+        """How many were lost just before this picture; None if it is the last one again."""
+        last, self._last = self._last, sequence
+        if last is None or sequence is None:
+            return 0
+        step = (sequence - last) % (1 << SEQUENCE_BITS)
+        if step == 0:
+            return None
+        return step - 1 if step <= MAX_GAP else 0

@@ -15,11 +15,11 @@ from typing import TypeAlias
 
 from aquaflow.config.link import UdpConfig
 from aquaflow.config.telemetry import AnyDevice, MavlinkConfig, NmeaConfig
-from aquaflow.drivers.events import about
+from aquaflow.drivers.link import about
 from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.transport import OpenLink
-from aquaflow.drivers.transport.shared_udp import SharedUdp
+from aquaflow.drivers.transport.socket import SharedUdp
 
 log = logging.getLogger(__name__)
 

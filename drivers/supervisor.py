@@ -9,9 +9,8 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Protocol, TypeAlias, runtime_checkable
 
-from aquaflow.drivers.events import Event, about
-from aquaflow.drivers.flow import DeviceState
-from aquaflow.drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
+from aquaflow.drivers.link import ByteLink, Event, LinkCounters, LinkDecoder, LinkLostError, about
+from aquaflow.drivers.live import DeviceState
 from aquaflow.drivers.transport import OpenLink
 from aquaflow.sources import RawTap
 from aquaflow.types import TelemetrySample

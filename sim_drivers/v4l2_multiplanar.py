@@ -7,8 +7,7 @@ import errno
 import struct
 from collections.abc import Sequence
 
-from aquaflow.sim_drivers.v4l2_buffers import PAGE_BITS, refusal
-from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
+from aquaflow.sim_drivers.v4l2_kernel import PAGE_BITS, V4l2Kernel, refusal
 
 PLANE_BYTES = 64
 """Size of ``struct v4l2_plane``: bytes used, length, offset of the memory, offset of the data."""

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from aquaflow.drivers.plausible import plausible
-from aquaflow.drivers.rotation import from_euler
+from aquaflow.drivers.fixes import from_euler, plausible
 from aquaflow.recordings.dataflash_gnss import GnssRecords
 from aquaflow.recordings.telemetry_log import TelemetryLog
 from aquaflow.types import Acceleration, Altitude, AngularRate, Attitude, Depth, TelemetrySample

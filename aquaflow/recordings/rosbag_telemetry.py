@@ -10,9 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from aquaflow.drivers.fixes import sigma_of
-from aquaflow.drivers.plausible import plausible
-from aquaflow.drivers.rotation import Vector, normalise, product
+from aquaflow.drivers.fixes import Vector, normalise, plausible, product, sigma_of
 from aquaflow.recordings.rosbag import decode, is_bag, messages_in, open_bag, origin_of, stamp_of
 from aquaflow.recordings.telemetry_log import LoggedUtc
 from aquaflow.types import (

@@ -10,9 +10,7 @@ import math
 from datetime import datetime, timezone
 from typing import TypeAlias
 
-from aquaflow.drivers.fixes import sigma_of
-from aquaflow.drivers.plausible import plausible
-from aquaflow.drivers.rotation import from_euler
+from aquaflow.drivers.fixes import from_euler, plausible, sigma_of
 from aquaflow.types import Altitude, Attitude, Depth, Position, TelemetrySample
 
 SECONDS, UTC = "t_s", "utc"

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from aquaflow.config.cameras import OakConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.drivers.capture import RawPicture, UnusablePictureError
-from aquaflow.drivers.events import about
+from aquaflow.drivers.link import about
 from aquaflow.drivers.live import LiveCamera
 from aquaflow.drivers.mounting import BodyFrame, Mounting
 from aquaflow.drivers.oak.dai_backend import DaiBackend

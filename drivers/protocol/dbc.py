@@ -6,15 +6,14 @@ CAN carries no time of measurement, so ``t_ns`` is the arrival.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from aquaflow.base.errors import ConfigError, reason_of
 from aquaflow.base.errors.extra import load
 from aquaflow.config.instruments import DbcConfig, DbcSignal
-from aquaflow.drivers.fixes import Fixes, sigma_of
-from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
-from aquaflow.drivers.protocol.packets import PacketDecoder
-from aquaflow.drivers.rotation import Vector, from_euler, normalise
+from aquaflow.drivers.fixes import Fixes, Vector, from_euler, normalise, sigma_of
+from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+from aquaflow.drivers.transport.can import EXTENDED, RECORD
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -120,3 +119,49 @@ def _in_body(mapping: DbcSignal, scaled: list[float], t_ns: int, source: str) ->
     if mapping.sample in VECTORS:
         return VECTORS[mapping.sample](t_ns, t_ns, source, (scaled[0], scaled[1], scaled[2]))
     return SCALARS[mapping.sample](t_ns, t_ns, source, scaled[0])
+
+
+# --------------------------------------------------------------------------------------------------
+# CAN frames in a stream of bytes: the records that :mod:`aquaflow.drivers.transport.can` makes.
+#
+# A bus loses whole frames only. The checks are for recordings and for whatever else feeds a
+# decoder.
+
+MAX_STANDARD, MAX_EXTENDED = 0x7FF, 0x1FFF_FFFF
+"""The largest identifiers of 11 and of 29 bits."""
+
+
+class CanFrame(NamedTuple):
+    """One frame of a CAN bus."""
+
+    identifier: int
+    extended: bool
+    data: bytes
+
+
+class CanFraming(Framing):
+    """Records of 16 bytes, recognised by the bytes that must be zero."""
+
+    longest = RECORD.size
+
+    def find(self, buffer: bytes, at: int) -> int:
+        return at
+
+    def length(self, buffer: bytes, at: int) -> int:
+        if len(buffer) - at < RECORD.size:
+            return INCOMPLETE
+        identifier, length, payload = RECORD.unpack_from(buffer, at)
+        allowed = EXTENDED | MAX_EXTENDED if identifier & EXTENDED else MAX_STANDARD
+        padding = buffer[at + 5 : at + 8] + payload[length:]
+        if identifier & ~allowed or length > len(payload) or any(padding):
+            return NO_PACKET
+        return RECORD.size
+
+    def intact(self, packet: bytes) -> bool:
+        return True  # the bus has tested its own checksum
+
+
+def frame_of(record: bytes) -> CanFrame:
+    """The frame in a record of :class:`CanFraming`."""
+    identifier, length, payload = RECORD.unpack(record)
+    return CanFrame(identifier & ~EXTENDED, bool(identifier & EXTENDED), payload[:length])

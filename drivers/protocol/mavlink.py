@@ -7,8 +7,7 @@ from collections import deque
 from typing import Any
 
 from aquaflow.config.telemetry import MavlinkConfig
-from aquaflow.drivers.device_clock import DeviceClock
-from aquaflow.drivers.events import about
+from aquaflow.drivers.link import DeviceClock, about
 from aquaflow.drivers.mavlink_dialect import dialect
 from aquaflow.drivers.protocol.mavlink_frames import Header, MavlinkFraming, header_of
 from aquaflow.drivers.protocol.mavlink_outbound import Receiver, messages_of

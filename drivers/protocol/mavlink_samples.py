@@ -10,8 +10,15 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import MavlinkConfig
-from aquaflow.drivers.fixes import Fixes, sigma_of
-from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalise, rotate
+from aquaflow.drivers.fixes import (
+    Fixes,
+    Quaternion,
+    from_euler,
+    inverse,
+    normalise,
+    rotate,
+    sigma_of,
+)
 from aquaflow.types import (
     Acceleration,
     Altitude,

@@ -11,7 +11,7 @@ from functools import reduce
 from operator import xor
 from typing import NamedTuple
 
-from aquaflow.drivers.protocol.lines import LineFraming
+from aquaflow.drivers.protocol.packets import LineFraming
 
 LONGEST = 256
 """Bytes. The standard has 82; proprietary sentences are longer."""

@@ -10,7 +10,7 @@ import logging
 import struct
 
 from aquaflow.config.instruments import PingConfig
-from aquaflow.drivers.events import about
+from aquaflow.drivers.link import about
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 from aquaflow.types import Altitude, TelemetrySample
 

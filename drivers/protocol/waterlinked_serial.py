@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 
 from aquaflow.config.instruments import WaterLinkedSerialConfig
-from aquaflow.drivers.protocol.lines import LineFraming
-from aquaflow.drivers.protocol.packets import PacketDecoder
-from aquaflow.drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
+from aquaflow.drivers.protocol.packets import LineFraming, PacketDecoder
+from aquaflow.drivers.protocol.waterlinked_json import attitude, bottom_track, measured_ns
 from aquaflow.types import TelemetrySample
 
 LONGEST = 512

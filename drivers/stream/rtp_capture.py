@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import socket
+import struct
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 from aquaflow.config.cameras import StreamConfig
-from aquaflow.drivers.capture import RawPicture
+from aquaflow.drivers.capture import Capture, RawPicture
 from aquaflow.drivers.ffmpeg import rgb_of
 from aquaflow.drivers.h264 import (
     KEY_PICTURE,
@@ -17,10 +19,10 @@ from aquaflow.drivers.h264 import (
     Units,
     decode,
 )
-from aquaflow.drivers.stream.ages import Ages
-from aquaflow.drivers.stream.depacketizer import Depacketizer, ReceivedPicture
-from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S
-from aquaflow.drivers.stream.session import Session
+from aquaflow.drivers.live import LiveCamera
+from aquaflow.drivers.stream.capture import OPEN_TIMEOUT_S, Ages, StreamCapture
+from aquaflow.drivers.stream.session import Session, is_at_a_port, session_of
+from aquaflow.drivers.stream.udp_port import bound, check_next_port, first_packet
 from aquaflow.types import CameraModel
 
 NEEDED = frozenset({KEY_PICTURE, SEQUENCE_PARAMETERS, PICTURE_PARAMETERS})
@@ -91,3 +93,189 @@ class RtpCapture:
         except TimeoutError as error:
             said = f"no packet came to UDP port {self._session.port.number}"
             raise TimeoutError(f"{said} for {self._config.stall_s:g} s") from error
+
+
+# --------------------------------------------------------------------------------------------------
+# H.264 pictures out of RTP packets (RFC 3550; RFC 6184, packetization modes 0 and 1).
+#
+# A picture is complete with its marked packet: nothing has to be waited for. FFmpeg waits for the
+# first packet of the next picture, and fills what lost packets leave open without a word.
+
+CLOCK_HZ = 90_000
+"""Of the time stamps of video (RFC 3551)."""
+HEADER_BYTES = 12
+"""Of an RTP packet without extensions."""
+LARGEST_WHOLE, AGGREGATE, FRAGMENT = 23, 24, 28
+"""Unit types: up to the first, a unit of H.264 itself; STAP-A, several of them; FU-A, a part."""
+KEPT_BITS, FIRST_BIT, LAST_BIT = 0xE0, 0x80, 0x40
+"""Of the first byte of a fragmented unit; of its second."""
+
+
+@dataclass
+class ReceivedPicture:
+    """An access unit."""
+
+    stream_ns: int
+    """When it was taken, on the sender's clock."""
+    arrival_ns: int
+    """When its first packet came."""
+    units: Units = field(default_factory=list)
+    is_whole: bool = True
+    """False where packets of it, or right before it, were lost."""
+
+
+class Depacketizer:
+    """The packets of one sender, in the order in which they come."""
+
+    def __init__(self, payload_type: int) -> None:
+        """Packets of other payload types are not looked at."""
+        self._payload_type = payload_type
+        self._number: int | None = None
+        """Of the packet that is expected."""
+        self._ticks: int | None = None
+        self._time = 0
+        self._picture: ReceivedPicture | None = None
+        self._fragments = bytearray()
+        self._gap = False
+        """Packets were lost right before the one at hand."""
+
+    def add(self, packet: bytes, arrival_ns: int) -> list[ReceivedPicture]:
+        """The pictures that this packet completes: one with its last packet, or one whose last
+        packet was lost."""
+        payload = self._payload(packet)
+        if payload is None:
+            return []
+        done = []
+        number, ticks = struct.unpack_from(">HI", packet, 2)
+        if self._is_late(number):
+            return []
+        if self._picture is not None and ticks != self._ticks:
+            self._picture.is_whole = False
+            done.append(self._finish())
+        self._begin(ticks, arrival_ns)
+        self._unpack(payload)
+        if packet[1] & 0x80:
+            done.append(self._finish())
+        return [picture for picture in done if picture.units]
+
+    def _payload(self, packet: bytes) -> bytes | None:
+        """Without header and padding; None where it is none of this stream's."""
+        if len(packet) <= HEADER_BYTES or packet[1] & 0x7F != self._payload_type:
+            return None
+        start = HEADER_BYTES + 4 * (packet[0] & 0x0F)
+        if packet[0] & 0x10 and len(packet) >= start + 4:
+            start += 4 + 4 * struct.unpack_from(">H", packet, start + 2)[0]
+        end = len(packet) - (packet[-1] if packet[0] & 0x20 else 0)
+        return packet[start:end] if start < end else None
+
+    def _is_late(self, number: int) -> bool:
+        """Notes what is missing; True for a packet that was missed already, or came twice."""
+        ahead = 0 if self._number is None else (number - self._number) & 0xFFFF
+        if ahead >= 0x8000:
+            return True
+        self._number = number + 1 & 0xFFFF
+        if ahead > 0:
+            self._gap = True
+            self._fragments.clear()
+            if self._picture is not None:
+                self._picture.is_whole = False
+        return False
+
+    def _begin(self, ticks: int, arrival_ns: int) -> None:
+        if self._picture is None:
+            step = 0 if self._ticks is None else (ticks - self._ticks + 2**31) % 2**32 - 2**31
+            self._ticks, self._time = ticks, self._time + step
+            stream_ns = self._time * 1_000_000_000 // CLOCK_HZ
+            self._picture = ReceivedPicture(stream_ns, arrival_ns, is_whole=not self._gap)
+        self._gap = False
+
+    def _finish(self) -> ReceivedPicture:
+        assert self._picture is not None
+        picture, self._picture = self._picture, None
+        picture.is_whole &= not self._fragments
+        self._fragments.clear()
+        return picture
+
+    def _unpack(self, payload: bytes) -> None:
+        assert self._picture is not None
+        kind = payload[0] & TYPE_BITS
+        if 0 < kind <= LARGEST_WHOLE:
+            self._picture.units.append(payload)
+        elif kind == AGGREGATE:
+            self._picture.units += _aggregate(payload)
+        elif kind == FRAGMENT and len(payload) > 2:
+            self._join(payload)
+        else:
+            self._picture.is_whole = False
+
+    def _join(self, payload: bytes) -> None:
+        """A part of a unit; of one whose beginning was lost, nothing is used."""
+        assert self._picture is not None
+        if payload[1] & FIRST_BIT:
+            self._fragments[:] = bytes([payload[0] & KEPT_BITS | payload[1] & TYPE_BITS])
+        elif not self._fragments:
+            self._picture.is_whole = False
+            return
+        self._fragments += payload[2:]
+        if payload[1] & LAST_BIT:
+            self._picture.units.append(bytes(self._fragments))
+            self._fragments.clear()
+
+
+def _aggregate(payload: bytes) -> Units:
+    units, at = [], 1
+    while at + 2 < len(payload):
+        (size,) = struct.unpack_from(">H", payload, at)
+        units.append(payload[at + 2 : at + 2 + size])
+        at += 2 + size
+    return units
+
+
+# --------------------------------------------------------------------------------------------------
+# A video stream as a live CameraSource.
+
+
+class StreamCamera(LiveCamera):
+    """The newest picture of a stream; connects again whenever it breaks."""
+
+    def __init__(self, name: str, config: StreamConfig) -> None:
+        super().__init__(name, config, lambda: open_stream(name, config))
+
+    @classmethod
+    def configured(cls, name: str, config: StreamConfig) -> StreamCamera:
+        """The camera of :func:`aquaflow.sources.open_camera`."""
+        return cls(name, config)
+
+
+# --------------------------------------------------------------------------------------------------
+# Which reader a stream needs: ours for H.264 in RTP at a port, FFmpeg for all else.
+
+MPEG_TS = 0x47
+"""First byte of each packet of MPEG-TS."""
+
+
+def open_stream(name: str, config: StreamConfig) -> Capture:
+    """Connect to the stream of the camera ``name``.
+
+    Raises:
+        ConnectionError: no server answers, a port is taken, or what comes is no video.
+        FileNotFoundError: there is no such SDP file.
+    """
+    if not is_at_a_port(config.url):
+        return StreamCapture(name, config, config.url)
+    session = session_of(config)
+    receiver = bound(session.port)
+    try:
+        packet = first_packet(receiver, session.port)
+        is_bare = packet[0] != MPEG_TS
+        payload_type = session.payload_type(packet) if is_bare else 0
+        if session.is_h264(payload_type):
+            return RtpCapture(name, config, session, receiver, packet)
+    except OSError:
+        receiver.close()
+        raise
+    receiver.close()  # FFmpeg opens the port itself
+    if not is_bare:
+        return StreamCapture(name, config, config.url)
+    check_next_port(session.port)
+    return StreamCapture(name, config, session.data_url(payload_type))

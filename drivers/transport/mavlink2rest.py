@@ -19,8 +19,7 @@ from urllib.parse import quote, urlsplit
 
 from aquaflow.base.errors.extra import load
 from aquaflow.config.link import Mavlink2restConfig
-from aquaflow.drivers.events import about
-from aquaflow.drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError
+from aquaflow.drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError, about
 from aquaflow.drivers.mavlink_dialect import dialect
 
 log = logging.getLogger(__name__)

@@ -10,11 +10,11 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.drivers.v4l2 import abi, abi_planes
+from aquaflow.drivers.v4l2 import abi
 from aquaflow.drivers.v4l2.planes import layout_of
 from aquaflow.drivers.v4l2.system import KernelInterface, call, supports
 
-TAKES_PICTURES = abi.CAP_VIDEO_CAPTURE | abi_planes.CAP_VIDEO_CAPTURE_MPLANE
+TAKES_PICTURES = abi.CAP_VIDEO_CAPTURE | abi.CAP_VIDEO_CAPTURE_MPLANE
 """In one piece or in several; codecs, which turn pictures into pictures, say otherwise."""
 
 

@@ -7,7 +7,7 @@ from itertools import chain, pairwise
 
 import pytest
 
-from aquaflow.drivers.stream.depacketizer import Depacketizer, ReceivedPicture
+from aquaflow.drivers.stream.rtp_capture import Depacketizer, ReceivedPicture
 from aquaflow.sim_drivers.rtp_camera import Packetizer
 
 NS = 1_000_000_000

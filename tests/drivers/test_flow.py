@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.drivers.flow import WINDOW_S, DeviceState
+from aquaflow.drivers.live import WINDOW_S, DeviceState
 
 SECOND = 1_000_000_000
 

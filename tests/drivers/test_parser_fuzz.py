@@ -12,8 +12,8 @@ from pathlib import Path
 import can
 import pytest
 
+from aquaflow.drivers.fixes import plausible
 from aquaflow.drivers.link import LinkCounters
-from aquaflow.drivers.plausible import plausible
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.telemetry import decoder_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD, pack

@@ -15,7 +15,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.drivers import ffmpeg
 from aquaflow.drivers.live import CameraState
-from aquaflow.drivers.stream.address import for_logs
+from aquaflow.drivers.stream.session import for_logs
 from aquaflow.recordings.transport_stream import UdpCamera
 from aquaflow.sim_drivers import mjpeg_server
 from aquaflow.sim_drivers.camera_feed import CameraFeed, Shot, first_images

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.drivers.stream.ages import PACED, StreamClock
+from aquaflow.drivers.stream.capture import PACED, StreamClock
 
 MS = 1_000_000
 PERIOD = 33 * MS

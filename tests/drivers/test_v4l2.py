@@ -16,11 +16,11 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.drivers.capture import UnusablePictureError
-from aquaflow.drivers.v4l2 import V4l2Camera, abi, abi_planes
+from aquaflow.drivers.v4l2 import V4l2Camera, abi
+from aquaflow.drivers.v4l2 import abi as abi_planes
 from aquaflow.drivers.v4l2.capture import V4l2Capture
 from aquaflow.drivers.v4l2.discovery import camera_nodes, find_camera, modes
-from aquaflow.drivers.v4l2.pixels import to_rgb
-from aquaflow.drivers.v4l2.planes import PictureFormat
+from aquaflow.drivers.v4l2.planes import PictureFormat, to_rgb
 from aquaflow.sim_drivers.camera_feed import CameraFaults, first_images
 from aquaflow.sim_drivers.v4l2_kernel import (
     EXPOSURE_ABSOLUTE,
