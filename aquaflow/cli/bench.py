@@ -57,7 +57,7 @@ def bench(
     """Run time against error: scenes x presets as a table, a picture and bench.json."""
     from aquaflow.config.presets import BY_EFFORT, FOR_A_GPU
     from aquaflow.lab.bench import benchmark as bm
-    from aquaflow.lab.bench.readme import around_section
+    from aquaflow.lab.bench.table import around_section
 
     if data is not None and suite is None and not scene:
         raise InputError(
@@ -77,7 +77,7 @@ def bench(
         scenes = bm.scenes_of(suite, data, scene or [], out, progress)
         result = bm.benchmark(scenes, contenders, repeats, out, progress, device=device)
     if readme is not None:
-        from aquaflow.lab.bench.readme import write_readme
+        from aquaflow.lab.bench.table import write_readme
 
         write_readme(readme, out / bm.PICTURE_FILE, result["machine"], result["runs"])
     if as_json:
@@ -104,7 +104,7 @@ def render(
     """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
     from aquaflow.lab.bench.meter import DEVICES
     from aquaflow.lab.bench.render import benchmark as bm
-    from aquaflow.lab.bench.render.sizes import QUICK_SIZES, SIZES
+    from aquaflow.lab.bench.render.table import QUICK_SIZES, SIZES
 
     device = None if device is None else one_of(DEVICES, device, "--device")
     sizes = QUICK_SIZES if quick else SIZES

@@ -219,7 +219,7 @@ def batch(
         "command line",
     )  # fmt: skip
     from aquaflow.lab.batch.batch import run_batch
-    from aquaflow.lab.batch.membership import Sites
+    from aquaflow.lab.batch.site import Sites
     from aquaflow.survey.site.manifest import is_site
     from aquaflow.survey.site.merging import add_to_site
 

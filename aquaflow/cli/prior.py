@@ -159,7 +159,7 @@ def train_mast3r(
     Several GPUs: torchrun --nproc-per-node 4 --no-python aquaflow lab prior train mast3r ...
     """
     from aquaflow.lab.training import finetune
-    from aquaflow.lab.training.distributed import joined_processes
+    from aquaflow.lab.training.trainer import joined_processes
     from aquaflow.prior.mast3r.export import LICENCE_NOTICE, load_checkpoint
 
     settings = finetune.FineTuningSettings(

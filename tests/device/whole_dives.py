@@ -11,7 +11,7 @@ from aquaflow.config import Config
 from aquaflow.config.presets import merge
 from aquaflow.dive.replay import map_recording
 from aquaflow.dive.run import Finished
-from aquaflow.lab.bench.altered import dim_light
+from aquaflow.lab.bench.ci_suite import dim_light
 from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.sources import open_recording
 from tests.device.device_scenes import ALL_PARTS

@@ -19,7 +19,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.ply import read_ply
 from aquaflow.geometry.camera import load_camera
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from tests.small_recording import FRAMES, HEIGHT, WIDTH
 
 METRICS = {

@@ -14,7 +14,7 @@ from aquaflow.config import parse_config
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.evaluation.trajectory import associate, read_tum
+from aquaflow.lab.evaluation.trajectory_error import associate, read_tum
 from tests.command_line import run_aquaflow
 from tests.small_recording import HASTY
 from tests.telemetry.known_lengths.boards_in_pictures import Printed

@@ -24,7 +24,7 @@ from aquaflow.dive.metric_outputs import (
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.trajectory_csv import read_trajectory_csv
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation

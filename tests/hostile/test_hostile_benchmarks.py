@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from aquaflow.lab.bench.picture import draw
-from aquaflow.lab.bench.readme import BEGIN, END
+from aquaflow.lab.bench.table import BEGIN, END
 from tests.command_line import Cli, refused
 
 FAILED_ROW = {"scene": "reef", "preset": "fast", "peer": None, "repeat": 0, "failed": "no map"}

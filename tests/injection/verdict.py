@@ -118,7 +118,7 @@ def _is_stated(name: str, stated: str) -> bool:
 
 def _read_pose_file(path: Path) -> None:
     from aquaflow.geometry.camera import load_camera
-    from aquaflow.lab.evaluation.trajectory import read_tum
+    from aquaflow.lab.evaluation.trajectory_error import read_tum
 
     if path.suffix == ".yaml":
         load_camera(path)

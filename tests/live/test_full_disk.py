@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.dive.frames_csv import read_rows
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from tests.command_line import Cli
 from tests.live.killed_dives import CONFIG

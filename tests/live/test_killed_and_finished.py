@@ -13,7 +13,7 @@ from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from tests.command_line import Cli
 from tests.live.killed_dives import CONFIG

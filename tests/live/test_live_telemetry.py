@@ -15,7 +15,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.alignment import align
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.live.checkpoint.generations import SetAside
 from aquaflow.live.checkpoint.repair import cut_at_checkpoint
 from aquaflow.live.checkpoint.resume import resume_folder

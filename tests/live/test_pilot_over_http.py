@@ -28,7 +28,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
 from aquaflow.drivers.v4l2 import V4l2Camera
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.live.checkpoint.generations import state_file
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import LiveFeed

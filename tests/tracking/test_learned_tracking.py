@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config import PriorConfig, SourceConfig
 from aquaflow.geometry.alignment import align
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.prior.factory import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD
 from aquaflow.sources import open_recording

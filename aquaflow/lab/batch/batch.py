@@ -20,14 +20,12 @@ from aquaflow.base.storage.whole_folder import FolderLock, remove_abandoned
 from aquaflow.config import Config
 from aquaflow.config.batch import BatchConfig
 from aquaflow.lab.batch.job import WRITTEN, BatchJob
-from aquaflow.lab.batch.journal import JOURNAL, Journal
-from aquaflow.lab.batch.membership import Sites, add_members, make_site
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
 from aquaflow.lab.batch.recordings import Recording, find_recordings
 from aquaflow.lab.batch.run_job import KILOBYTE, MEGABYTE
-from aquaflow.lab.batch.season import Season, run_season
-from aquaflow.lab.batch.site import DIVES
+from aquaflow.lab.batch.season import JOURNAL, Journal, Season, run_season
+from aquaflow.lab.batch.site import DIVES, Sites, add_members, make_site
 from aquaflow.lab.batch.workers import LocalWorkers, Workers
 
 Progress = Callable[[str, int, int | None], None]

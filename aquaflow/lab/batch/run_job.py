@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from signal import Signals
@@ -21,7 +25,6 @@ from aquaflow.lab.batch.manifest import write_manifest
 from aquaflow.lab.batch.mapping_process import outcome_of_failure
 from aquaflow.lab.batch.object_store import ObjectStore, StoreError, is_url
 from aquaflow.lab.batch.site import DiveStore, open_site
-from aquaflow.lab.batch.started import RunningProcesses
 
 PROGRAM = "aquaflow.lab.batch.mapping_process"
 KILOBYTE = 1024
@@ -132,3 +135,42 @@ def _death_message(code: int, memory_mb: int) -> str:
     if code < 0:
         return f"its process crashed ({Signals(-code).name}); the recording may be damaged"
     return f"its process ended with status {code} and said nothing"
+
+
+# --------------------------------------------------------------------------------------------------
+# The processes that a batch has started on this machine, to stop them when it ends early.
+
+
+class RunningProcesses:
+    """Processes that run now. Of any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._processes: set[subprocess.Popen[bytes]] = set()
+        self._stopped = False
+
+    @contextlib.contextmanager
+    def running(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
+        """``process`` may be stopped while the block runs."""
+        with self._lock:
+            self._processes.add(process)
+            if self._stopped:
+                _kill(process)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._processes.discard(process)
+
+    def stop(self) -> None:
+        """Kill every process, and what is started from now on."""
+        with self._lock:
+            self._stopped = True
+            for process in self._processes:
+                _kill(process)
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    # Not Popen.kill: that may take the status from the thread that waits for it.
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process.pid, signal.SIGKILL)

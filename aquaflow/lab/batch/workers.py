@@ -7,8 +7,7 @@ import threading
 from typing import Protocol
 
 from aquaflow.lab.batch.job import BatchJob, BatchOutcome
-from aquaflow.lab.batch.run_job import run_job
-from aquaflow.lab.batch.started import RunningProcesses
+from aquaflow.lab.batch.run_job import RunningProcesses, run_job
 
 
 class Workers(Protocol):

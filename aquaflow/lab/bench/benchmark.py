@@ -12,9 +12,8 @@ from aquaflow.config.presets import preset
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.ci_suite import ci_scenes
 from aquaflow.lab.bench.picture import draw
-from aquaflow.lab.bench.real_suite import real_scenes
 from aquaflow.lab.bench.runner import Contender, Perform, Progress, in_process, jobs_for, run_all
-from aquaflow.lab.bench.scene import BenchmarkScene, scene_at
+from aquaflow.lab.bench.scene import BenchmarkScene, real_scenes, scene_at
 
 JSON_FILE, PICTURE_FILE = "bench.json", "bench.png"
 """What a benchmark writes."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.lab.bench.real_suite import SIDE_BY_SIDE
+from aquaflow.lab.bench.scene import SIDE_BY_SIDE
 from aquaflow.lab.evaluation.held_out import Picture, held_out_indices, read_picture
 from aquaflow.lab.evaluation.restoration import clean_pictures
 

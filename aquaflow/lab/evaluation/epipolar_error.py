@@ -24,7 +24,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.two_view import MIN_MATCHES, epipolar_distances, relative_pose
 from aquaflow.lab.evaluation.dive_files import evaluated_dive
-from aquaflow.lab.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
+from aquaflow.lab.evaluation.trajectory_error import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.lab.evaluation.truth import read_truth
 from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow import normalised_grey

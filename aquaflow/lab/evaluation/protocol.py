@@ -15,12 +15,14 @@ import numpy as np
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.medium import NAME as MEDIUM
-from aquaflow.lab.evaluation import medium as water
+from aquaflow.lab.evaluation import metric_error as water
 from aquaflow.lab.evaluation.dive_files import EvaluatedDive, evaluated_dive
 from aquaflow.lab.evaluation.metric_error import MetricError, metric_error
-from aquaflow.lab.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.lab.evaluation.trajectory_error import (
+    ASSOCIATION_TOLERANCE_S,
+    Trajectory,
     TrajectoryError,
+    associate,
     horizontal_error,
     position_error,
     trajectory_error,

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.lab.evaluation.held_out import Kind, held_out_indices, read_picture, read_range
-from aquaflow.lab.evaluation.water_peers import grey_world, sea_thru, udcp
+from aquaflow.lab.evaluation.water_peers import contract, sea_thru, udcp
 from aquaflow.lab.evaluation.water_peers.contract import (
     NAMES,
     Method,
@@ -188,7 +188,7 @@ def _frames(clean: Path, indices: list[int]) -> Iterator[Frame]:
 METHODS: dict[str, Method] = {
     "sea_thru": sea_thru.restore,
     "udcp": udcp.restore,
-    "grey_world": grey_world.restore,
+    "grey_world": contract.restore,
 }
 
 

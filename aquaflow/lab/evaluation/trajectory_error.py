@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from aquaflow.dive.tum import ASSOCIATION_TOLERANCE_S, Trajectory, associate, read_tum
 from aquaflow.geometry.alignment import Alignment, align
-from aquaflow.lab.evaluation.trajectory import Trajectory
 
 Positions = npt.NDArray[np.float64]
 
@@ -201,3 +201,9 @@ def _rms(
     values: Positions,  # [P]
 ) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+# --------------------------------------------------------------------------------------------------
+# Trajectories of different sources, associated by time.
+
+__all__ = ["ASSOCIATION_TOLERANCE_S", "Trajectory", "associate", "read_tum"]

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.lab.evaluation.trajectory import Trajectory, read_tum
+from aquaflow.lab.evaluation.trajectory_error import Trajectory, read_tum
 
 SYNTHETIC_POSES = "poses.tum"
 SYNTHETIC_MEDIUM = "medium.yaml"

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.stress.snow import marine_snow
+from aquaflow.lab.stress.images import marine_snow
 from aquaflow.lab.stress.swim import CAMERA, FRAME_NS, Array, Picture, pose
 from aquaflow.types import Frame
 

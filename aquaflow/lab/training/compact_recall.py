@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from aquaflow.lab.training.compact_range import Compare, range_error
-from aquaflow.lab.training.correspondences import Correspondences, correspondences
-from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pairs import Pair
+from aquaflow.lab.training.pair_generator.noise import Draw
+from aquaflow.lab.training.pairs import Correspondences, Pair, correspondences
 from aquaflow.prior import flow as dense
 from aquaflow.prior.compact.export import INPUTS
 from aquaflow.prior.compact.network import (

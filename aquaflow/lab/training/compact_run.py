@@ -23,19 +23,23 @@ from aquaflow.lab.training.compact_recall import (
     onnx_encoder,
     tracked_recall,
 )
-from aquaflow.lab.training.curve import NOT_FIGURES
 from aquaflow.lab.training.held_out import RANGE_SET, SETS, held_out_pairs, turned_pictures
 from aquaflow.lab.training.held_out import SEED as HELD_OUT_SEED
-from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water
 from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
-from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.scene import Detail
-from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
+from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, Pool
 from aquaflow.lab.training.pairs import Pair
-from aquaflow.lab.training.schedule import Schedule
-from aquaflow.lab.training.trainer import Progress, TrainingPlan, has_ended, train
+from aquaflow.lab.training.trainer import (
+    NOT_FIGURES,
+    Progress,
+    Schedule,
+    TrainingPlan,
+    has_ended,
+    train,
+)
 from aquaflow.prior.compact.export import export
 from aquaflow.prior.compact.network import CompactPrior
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, write_card

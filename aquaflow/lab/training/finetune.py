@@ -25,11 +25,9 @@ from aquaflow.lab.training.datasets.mimir import mimir
 from aquaflow.lab.training.datasets.posed import Frames, Posed, nothing_in, read_image
 from aquaflow.lab.training.datasets.tartanair import tartanair
 from aquaflow.lab.training.datasets.uwstereo import uwstereo
-from aquaflow.lab.training.distributed import TrainingProcess
 from aquaflow.lab.training.losses import Losses, LossWeights, pair_loss
 from aquaflow.lab.training.mining import MinedPairs, load_index, mine, save_index
-from aquaflow.lab.training.schedule import Schedule
-from aquaflow.lab.training.trainer import Progress, TrainingPlan, train
+from aquaflow.lab.training.trainer import Progress, Schedule, TrainingPlan, TrainingProcess, train
 from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
 
 # --------------------------------------------------------------------------------------------------

@@ -8,17 +8,15 @@ from pathlib import Path
 
 import torch
 
-from aquaflow.lab.training.correspondences import overlap
 from aquaflow.lab.training.pair_generator.cameras import TRAINING, WIDE, WIDER, PairMotion
 from aquaflow.lab.training.pair_generator.conditions import CALM, Conditions
-from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water, windows
-from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.sensor import take_picture
-from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
-from aquaflow.lab.training.pairs import Pair
+from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, Pool
+from aquaflow.lab.training.pairs import Pair, overlap
 
 SEED = 1000
 """Of the scenes that are never trained on, and of their water."""

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.lab.training.correspondences import correspondences, nearest_pixels
-from aquaflow.lab.training.pairs import Pair, true_pointmaps
+from aquaflow.lab.training.pairs import Pair, correspondences, nearest_pixels, true_pointmaps
 
 
 @dataclass(frozen=True)

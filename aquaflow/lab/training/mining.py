@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.training.correspondences import nearest_pixels, overlap, project
 from aquaflow.lab.training.datasets.posed import Posed
 from aquaflow.lab.training.datasets.posed import Sequence as Scene
-from aquaflow.lab.training.pairs import Pair, ViewBatch, seen_from
+from aquaflow.lab.training.pairs import Pair, ViewBatch, nearest_pixels, overlap, project, seen_from
 
 LEAST_OVERLAP = 0.3
 """Of the valid pixels, seen by both (paper, Sec. 3.1)."""

@@ -9,20 +9,20 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch import distributed as dist
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.lab.training.curve import draw_curve
-from aquaflow.lab.training.distributed import TrainingProcess
-from aquaflow.lab.training.schedule import Schedule
 
 log = logging.getLogger(__name__)
 
@@ -195,3 +195,130 @@ def _resume(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) ->
             f"{path} is the checkpoint of another network; give another --out"
         ) from error
     return _Run(int(state["step"]), float(state["cpu_s"]), list(state["history"]))
+
+
+# --------------------------------------------------------------------------------------------------
+# A picture of how a training goes.
+
+NOT_FIGURES = ("step", "cpu_s", "rate")
+"""Keys of the history that are not drawn."""
+
+
+def draw_curve(history: list[dict[str, float]], path: Path) -> None:
+    """Training terms on the left, held-out figures on the right, both over CPU time."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
+    minutes = [row["cpu_s"] / 60.0 for row in history]
+    for name in history[-1]:
+        if name in NOT_FIGURES:
+            continue
+        values = [row.get(name, float("nan")) for row in history]
+        loss = name.startswith("loss_")
+        axes[0 if loss else 1].plot(minutes, values, marker=".", label=name.removeprefix("loss_"))
+    for axis, title in zip(axes, ("training loss", "held-out pairs"), strict=True):
+        axis.set_title(title)
+        axis.set_xlabel("CPU minutes")
+        axis.grid(alpha=0.3)
+        if axis.lines:
+            axis.legend(fontsize=8)
+    figure.savefig(path, dpi=100)
+
+
+# --------------------------------------------------------------------------------------------------
+# The learning rate over a training: a linear start, then half a cosine (paper, Sec. 4).
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Rates by step; defaults are those of the paper's fine-tuning."""
+
+    steps: int
+    warm_up: int
+    """Steps of the linear start."""
+    highest: float = 1e-6
+    lowest: float = 1e-7
+    hold: int = 0
+    """Steps at the highest rate before the cosine begins: a run whose length is not known yet holds
+    it, and is resumed with the length that there turned out to be time for."""
+
+    def rate(self, step: int) -> float:
+        """Of the optimiser's step number ``step``, counted from 0."""
+        if step < self.warm_up:
+            return self.highest * (step + 1) / self.warm_up
+        begins = self.warm_up + self.hold
+        share = (step - begins) / max(self.steps - 1 - begins, 1)
+        share = min(max(share, 0.0), 1.0)
+        return self.lowest + (self.highest - self.lowest) * 0.5 * (1.0 + math.cos(math.pi * share))
+
+
+# --------------------------------------------------------------------------------------------------
+# Several processes that train one network, each on batches of its own (torchrun).
+#
+# Gradients are averaged once a step, after all batches of the step were summed up: the exchange
+# then costs the same however many batches a step has.
+
+
+class TrainingProcess:
+    """This process among those that train; alone unless torchrun started it."""
+
+    rank = 0
+    count = 1
+    device = torch.device("cpu")
+
+    @property
+    def leads(self) -> bool:
+        """True for the one process that writes files."""
+        return self.rank == 0
+
+    def average(
+        self,
+        parameters: Iterable[Tensor],  # [...] each
+    ) -> None:
+        """Replace every gradient by its mean over the processes."""
+
+    def wait(self) -> None:
+        """Until every process is here."""
+
+
+class DistributedProcess(TrainingProcess):
+    """A process that torchrun started, once its group is there."""
+
+    def __init__(self) -> None:
+        self.rank, self.count = dist.get_rank(), dist.get_world_size()
+        if torch.cuda.is_available():
+            self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+
+    def average(
+        self,
+        parameters: Iterable[Tensor],  # [...] each
+    ) -> None:
+        """What one process has no gradient for counts as zero."""
+        for parameter in parameters:
+            if not parameter.requires_grad:
+                continue
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            dist.all_reduce(parameter.grad)
+            parameter.grad /= self.count
+
+    def wait(self) -> None:
+        """Until every process is here."""
+        dist.barrier()
+
+
+@contextmanager
+def joined_processes() -> Iterator[TrainingProcess]:
+    """The processes that torchrun started, or this one alone."""
+    if "RANK" not in os.environ:
+        alone = TrainingProcess()
+        if torch.cuda.is_available():
+            alone.device = torch.device("cuda")
+        yield alone
+        return
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    try:
+        yield DistributedProcess()
+    finally:
+        dist.destroy_process_group()

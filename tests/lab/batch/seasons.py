@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from aquaflow.lab.batch.journal import JOURNAL
+from aquaflow.lab.batch.season import JOURNAL
 from tests.small_recording import GIVE_UP_S
 
 FROM_RUN_TO_RUN = {"metrics.json", "report.html", "log.jsonl", "manifest.json"}

@@ -8,13 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-from aquaflow.lab.batch.journal import Journal
+from aquaflow.lab.batch.season import Journal
 from tests.lab.batch.seasons import read_journal
 
 WRITER = """
 import sys
 from pathlib import Path
-from aquaflow.lab.batch.journal import Journal
+from aquaflow.lab.batch.season import Journal
 journal = Journal(Path(sys.argv[1]))
 print("open", flush=True)
 for number in range(10**9):

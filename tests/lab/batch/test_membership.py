@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from aquaflow.lab.batch.membership import Sites, add_members, make_site
+from aquaflow.lab.batch.site import Sites, add_members, make_site
 from aquaflow.survey.site.manifest import is_site, read_site
 from aquaflow.survey.site.merging import add_to_site
 from tests.command_line import Cli

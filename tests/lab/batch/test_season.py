@@ -9,8 +9,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.lab.batch.job import BatchJob, BatchOutcome
-from aquaflow.lab.batch.journal import Journal
-from aquaflow.lab.batch.season import End, Season, failed_jobs, run_season
+from aquaflow.lab.batch.season import End, Journal, Season, failed_jobs, run_season
 from aquaflow.lab.batch.workers import LocalWorkers
 from tests.lab.batch.seasons import read_journal
 

@@ -21,15 +21,15 @@ from aquaflow.lab.bench import machine, meter, worker
 from aquaflow.lab.bench.benchmark import benchmark, contenders_of
 from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.meter import OnCuda, meter_of, require
-from aquaflow.lab.bench.readme import section
 from aquaflow.lab.bench.render import benchmark as bm
-from aquaflow.lab.bench.render import contenders, sizes, timing
+from aquaflow.lab.bench.render import contenders, timing
+from aquaflow.lab.bench.render import table as sizes
 from aquaflow.lab.bench.render.contenders import Timed
 from aquaflow.lab.bench.render.parts import parts_of
 from aquaflow.lab.bench.render.rows import row_of
 from aquaflow.lab.bench.render.table import print_result
 from aquaflow.lab.bench.scene import BenchmarkScene, scene_at
-from aquaflow.lab.bench.table import markdown
+from aquaflow.lab.bench.table import markdown, section
 from aquaflow.render import gsplat
 from aquaflow.render.contract import CPU
 from aquaflow.render.example_scene import Size, height_field

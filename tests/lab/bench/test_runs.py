@@ -15,11 +15,10 @@ from aquaflow.lab.bench import ablation
 from aquaflow.lab.bench.benchmark import benchmark, contenders_of, scenes_of
 from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.picture import pareto_front
-from aquaflow.lab.bench.readme import BEGIN, END, section, write_readme
 from aquaflow.lab.bench.runner import KEYS, Contender, in_process, jobs_for
 from aquaflow.lab.bench.scene import BenchmarkScene, scene_at
 from aquaflow.lab.bench.summary import ATE_PCT, PSNR, lines_of
-from aquaflow.lab.bench.table import failures, features, markdown
+from aquaflow.lab.bench.table import BEGIN, END, failures, features, markdown, section, write_readme
 from aquaflow.lab.evaluation.water_peers.contract import NAMES
 from aquaflow.prior.folder import CARD
 from tests.command_line import run_aquaflow

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.bench.altered import dim_light, pause
-from aquaflow.lab.bench.real_suite import real_scenes
-from aquaflow.lab.bench.scene import scene_at
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.bench.ci_suite import dim_light, pause
+from aquaflow.lab.bench.scene import real_scenes, scene_at
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.sources import open_recording
 
 

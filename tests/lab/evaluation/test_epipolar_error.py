@@ -15,7 +15,7 @@ from aquaflow.config import Config
 from aquaflow.dive.tum import write_tum
 from aquaflow.lab.evaluation.epipolar_error import evaluate_epipolar
 from aquaflow.lab.evaluation.summary import in_words
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 
 
 def bent(path: Path, degrees: float, to: Path) -> Path:

@@ -14,7 +14,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.evaluation.metric_error import MetricError, level_error, metric_error
 from aquaflow.lab.evaluation.protocol import evaluate_dive
 from aquaflow.lab.evaluation.summary import in_words
-from aquaflow.lab.evaluation.trajectory import Trajectory
+from aquaflow.lab.evaluation.trajectory_error import Trajectory
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import SIGMAS, metric_frame

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.base.errors import InputError
 from aquaflow.dive.tum import write_tum
 from aquaflow.lab.evaluation.protocol import evaluate_dive
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.lab.synthetic.water import WATER_TYPES, save_medium
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"

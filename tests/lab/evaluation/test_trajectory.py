@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.base.errors import InputError
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.evaluation.trajectory import associate, read_tum
+from aquaflow.lab.evaluation.trajectory_error import associate, read_tum
 
 POSE = "0.0 1 2 3 0 0 0 1\n"
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.evaluation.trajectory import Trajectory
 from aquaflow.lab.evaluation.trajectory_error import (
+    Trajectory,
     horizontal_error,
     position_error,
     trajectory_error,

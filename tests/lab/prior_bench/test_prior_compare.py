@@ -17,12 +17,13 @@ from aquaflow.base.errors import AquaFlowError, ConfigError, InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.evaluation.matching import HEIGHT, WIDTH
-from aquaflow.lab.prior_bench import comparison, known_pairs
+from aquaflow.lab.prior_bench import comparison
 from aquaflow.lab.prior_bench import comparison as clip_pairs
+from aquaflow.lab.prior_bench import comparison as known_pairs
 from aquaflow.lab.prior_bench.comparison import DenseMethod, SparseMethod, compare, methods_here
 from aquaflow.lab.prior_bench.latency import sea_floor
 from aquaflow.lab.prior_bench.pair import FoundMatches, KnownPair
-from aquaflow.lab.prior_bench.pair_figures import figures_of
+from aquaflow.lab.prior_bench.table import figures_of
 from aquaflow.lab.training.pair_generator.cameras import WIDE
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.flow import pixel_grid

@@ -16,7 +16,7 @@ from aquaflow.lab.training.compact_range import (
     range_loss,
     variance_factor,
 )
-from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pairs import Pair, ViewBatch
 from aquaflow.prior.compact.network import COARSE, Compared, Encoded
 

@@ -27,11 +27,11 @@ from aquaflow.lab.training.compact_run import (
     training_record,
     with_honest_range,
 )
-from aquaflow.lab.training.correspondences import overlap
 from aquaflow.lab.training.held_out import SETS, held_out_pairs, turned_pictures
 from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
-from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.scene import Detail
+from aquaflow.lab.training.pair_generator.stored_pairs import Pool
+from aquaflow.lab.training.pairs import overlap
 from aquaflow.prior.compact import network as compact_network
 from aquaflow.prior.compact.network import CompactPrior, Encoded, NetworkSize
 from aquaflow.prior.folder import read_card

@@ -18,18 +18,24 @@ from aquaflow.base.errors import InputError
 from aquaflow.lab.training import compact
 from aquaflow.lab.training.compact import CompactSettings, CompactTask, coarse_loss, compact_losses
 from aquaflow.lab.training.compact_recall import mean_recall
-from aquaflow.lab.training.correspondences import Correspondences
 from aquaflow.lab.training.pair_generator.cameras import TRAINING
-from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import WindowVariation, training_pair
 from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
-from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.render import render_pairs
 from aquaflow.lab.training.pair_generator.scene import Detail
-from aquaflow.lab.training.pairs import Pair
-from aquaflow.lab.training.schedule import Schedule
-from aquaflow.lab.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, has_ended, train
+from aquaflow.lab.training.pair_generator.stored_pairs import Pool
+from aquaflow.lab.training.pairs import Correspondences, Pair
+from aquaflow.lab.training.trainer import (
+    CHECKPOINT,
+    CURVE,
+    HISTORY,
+    Schedule,
+    TrainingPlan,
+    has_ended,
+    train,
+)
 from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
 from tests.lab.training.small_maps import small_dive
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from aquaflow.lab.training.correspondences import correspondences, overlap
-from aquaflow.lab.training.pairs import Pair, true_pointmaps
+from aquaflow.lab.training.pairs import Pair, correspondences, overlap, true_pointmaps
 from tests.lab.training.plane_pairs import FOCAL_PX, plane_view, shifted_pair
 
 pytestmark = pytest.mark.usefixtures("one_thread")

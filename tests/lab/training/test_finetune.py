@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 
 from aquaflow import cli
 from aquaflow.base.errors import InputError
-from aquaflow.lab.training import distributed as processes
 from aquaflow.lab.training import finetune
-from aquaflow.lab.training.distributed import DistributedProcess, TrainingProcess
+from aquaflow.lab.training import trainer as processes
 from aquaflow.lab.training.finetune import (
     FineTuning,
     FineTuningSettings,
@@ -25,6 +24,7 @@ from aquaflow.lab.training.finetune import (
     read_data,
 )
 from aquaflow.lab.training.mining import MinedPairs
+from aquaflow.lab.training.trainer import DistributedProcess, TrainingProcess
 from aquaflow.prior.mast3r import export as weights
 from aquaflow.prior.mast3r.network import TINY, Mast3r
 from tests.lab.training.data_trees import write_colmap, write_tartanair
@@ -155,8 +155,8 @@ import torch
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.network import TINY
 from aquaflow.lab.training import finetune
-from aquaflow.lab.training.distributed import joined_processes
-from aquaflow.lab.training.schedule import Schedule
+from aquaflow.lab.training.trainer import joined_processes
+from aquaflow.lab.training.trainer import Schedule
 from aquaflow.lab.training.trainer import TrainingPlan
 
 torch.set_num_threads(1)

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from aquaflow.lab.training.losses import LossWeights, info_nce, match_loss, pair_loss, points_loss
 from aquaflow.lab.training.pairs import Pair, true_pointmaps
-from aquaflow.lab.training.schedule import Schedule
+from aquaflow.lab.training.trainer import Schedule
 from tests.lab.training.plane_pairs import shifted_pair
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -12,7 +12,6 @@ import torch
 
 from aquaflow.base.errors import InputError
 from aquaflow.lab.training import mining
-from aquaflow.lab.training.correspondences import overlap
 from aquaflow.lab.training.datasets.posed import Frames, Posed
 from aquaflow.lab.training.datasets.tartanair import tartanair
 from aquaflow.lab.training.mining import (
@@ -24,7 +23,7 @@ from aquaflow.lab.training.mining import (
     valid_pixels,
     view_of,
 )
-from aquaflow.lab.training.pairs import true_pointmaps
+from aquaflow.lab.training.pairs import overlap, true_pointmaps
 from tests.lab.training.data_trees import FOCAL, STEP_M, WIDTH, depth_at, write_tartanair
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -15,7 +15,7 @@ import pytest
 from aquaflow.base.storage.dive_status import DiveState, read_status
 from aquaflow.dive.ply import read_ply
 from aquaflow.drivers.protocol.mavlink import ACCEPTED, FIRST_COMMAND, OUR_COMPONENT, REFUSED_NOW
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.live.checkpoint.generations import state_file
 from aquaflow.sources.outbound import LONGEST_TEXT
 from tests.browser import Browser, needs_browser

@@ -17,7 +17,7 @@ from aquaflow.base.storage import spill
 from aquaflow.config.service import CheckpointConfig, ViewerConfig
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
-from aquaflow.lab.evaluation.trajectory import read_tum
+from aquaflow.lab.evaluation.trajectory_error import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from aquaflow.live.checkpoint.resume import choose, is_begun, resume_folder
 from aquaflow.live.clock_reading import ClockReading, Continued

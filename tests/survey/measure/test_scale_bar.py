@@ -16,7 +16,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import load_camera
-from aquaflow.lab.evaluation.trajectory import associate, read_tum
+from aquaflow.lab.evaluation.trajectory_error import associate, read_tum
 from aquaflow.survey.measure.scale_bar import between_pixels, between_points
 from aquaflow.telemetry.known_lengths.known_length import (
     FILE,

@@ -12,11 +12,11 @@ from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.meter import require
-from aquaflow.lab.bench.render.blend_limit import measure_blend_limit
 from aquaflow.lab.bench.render.contenders import (
     BenchmarkedRenderer,
     Timed,
     contenders_here,
+    measure_blend_limit,
     thread_counts,
 )
 from aquaflow.lab.bench.render.interactions import count_interactions

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import dataclass
+import shlex
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
-from aquaflow.base.errors import AquaFlowError
+import torch
+
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.lab.bench.meter import Meter
-from aquaflow.lab.bench.render.opensplat import NOTE, OpenSplat
 from aquaflow.lab.bench.render.timing import Clock, Sample, time_renderer, torch_threads
 from aquaflow.render.contract import Renderer
 from aquaflow.render.cpu import CpuRenderer, TileRenderer
-from aquaflow.render.example_scene import SMALL, Size, SplatScene
+from aquaflow.render.example_scene import NAMES, SMALL, Size, SplatScene, height_field
 from aquaflow.render.gsplat import GsplatRenderer
 from aquaflow.render.library import NativeUnavailableError
 from aquaflow.render.native.build import supported_isas
@@ -139,3 +146,152 @@ def contenders_here(
         found.append(OpenSplat(opensplat))
         notes.append(NOTE)
     return found, notes
+
+
+# --------------------------------------------------------------------------------------------------
+# OpenSplat's CPU kernels compared with ours, through a program that the user brings.
+#
+# OpenSplat is AGPL: AquaFlow neither holds nor loads any of it. The program is called as ``COMMAND
+# FOLDER``, once for every sample. FOLDER holds ``scene.json`` (``n``, ``width``, ``height``, and
+# ``arrays``: name -> shape) and for each array ``NAME.f32``: float32, little-endian, row-major.
+# Names, axes and units are those of the renderer contract; ``K`` is the 3 x 3 intrinsic matrix,
+# ``g_image`` and ``g_alpha`` are the gradients that come in. Colours have three channels, all that
+# OpenSplat draws. The last line that the program prints is ``{"fwd_ms": number, "bwd_ms":
+# number}``, warm-up and loading not counted.
+
+NOTE = (
+    "OpenSplat's CPU depth sort, built against current torch as it is, reads a strided depth "
+    "tensor as contiguous and sorts by the wrong key: compare its times, not its pictures. Its "
+    "kernel is serial and draws three channels where the others draw four."
+)
+"""Printed with its numbers."""
+LIMIT_S = 600.0
+"""A program that takes longer has failed."""
+CHANNELS = 3
+"""Red, green, blue; the others draw the range too."""
+
+
+class OpenSplat:
+    """A contender whose samples come from the user's program."""
+
+    name = "opensplat"
+    isa = "user's build"
+    threads = 1
+    slow = True
+
+    def __init__(self, command: str) -> None:
+        """Raises InputError when there is no such program."""
+        self.command = command
+        try:
+            self.words = shlex.split(command)
+        except ValueError as error:
+            raise InputError(f"--opensplat {command} is no command: {error}") from error
+        if not self.words or shutil.which(self.words[0]) is None:
+            raise InputError(
+                f"--opensplat {command}: there is no such program; give COMMAND [ARGS]"
+            )
+
+    def takes(self, size: Size) -> bool:
+        """The user's program is asked for every size."""
+        return True
+
+    def sample(self, scene: SplatScene) -> Sample:
+        """Raises InputError when the program fails or does not print its times."""
+        with tempfile.TemporaryDirectory() as folder:
+            write_scene(scene, Path(folder))
+            printed = self._run(folder)
+        try:
+            said = json.loads(printed.strip().splitlines()[-1])
+            return Sample(float(said["fwd_ms"]), float(said["bwd_ms"]))
+        except (IndexError, KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"--opensplat {self.command}: its last line is not "
+                '{"fwd_ms": number, "bwd_ms": number}; print that'
+            ) from error
+
+    def _run(self, folder: str) -> str:
+        try:
+            done = subprocess.run(
+                [*self.words, folder],
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=LIMIT_S,
+                check=False,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise InputError(f"--opensplat {self.command} does not run: {error}") from error
+        if done.returncode != 0:
+            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            raise InputError(f"--opensplat {self.command} failed ({done.returncode}): {last}")
+        return done.stdout
+
+
+def write_scene(scene: SplatScene, folder: Path) -> None:
+    """The files that the program reads."""
+    arrays = dict(zip(NAMES, scene.inputs, strict=True))
+    arrays |= {"K": scene.K, "g_image": scene.g_image, "g_alpha": scene.g_alpha}
+    for name in ("colours", "g_image"):
+        arrays[name] = arrays[name][..., :CHANNELS]
+    for name, tensor in arrays.items():
+        tensor.contiguous().numpy().astype("<f4").tofile(folder / f"{name}.f32")
+    size = {"n": scene.size.n, "width": scene.size.width, "height": scene.size.height}
+    shapes = {name: list(tensor.shape) for name, tensor in arrays.items()}
+    (folder / "scene.json").write_text(json.dumps({**size, "arrays": shapes}) + "\n")
+
+
+# --------------------------------------------------------------------------------------------------
+# What the blending loops do where nothing is in vain: the limit of their mix of instructions.
+#
+# The processor's peak counts fused multiply-adds alone. Blending one Gaussian into one pixel also
+# takes an exponential, comparisons, masks, loads and stores, and backward a division, which fill
+# the same units and count as one operation or none. How much of the peak is left for that mix is
+# measured with the loops themselves: on a picture so small that all data is in the first caches,
+# with Gaussians that reach every pixel of every tile.
+
+COVERING = Size(100, 64, 64)
+"""Sixteen tiles; at an alpha of OPACITY the last Gaussian still finds a transmittance of 0.006."""
+OPACITY = 0.05
+SIGMA = 50.0
+"""Standard deviation, in ranges of the nearest: alpha is the same all over the picture."""
+ATTEMPTS = 25
+"""The fastest counts; each takes a millisecond."""
+FORWARD_STAGE, BACKWARD_STAGE = "blend", "blend backward"
+
+
+@dataclass(frozen=True)
+class BlendLimit:
+    """Pairs of a pixel and a Gaussian that one thread blends in a second, at most."""
+
+    fwd: float
+    bwd: float
+
+    def seconds(self, interactions: int) -> dict[str, float]:
+        """The least that ``interactions`` take one thread, by pass."""
+        return {"fwd": interactions / self.fwd, "bwd": interactions / self.bwd}
+
+
+def covering_scene() -> SplatScene:
+    """COVERING, with Gaussians one behind the other that all reach every pixel."""
+    scene, n = height_field(COVERING), COVERING.n
+    means, scales = torch.zeros(n, 3), torch.full((n, 3), SIGMA)
+    means[:, 2], scales[:, 2] = torch.linspace(1.0, 2.0, n), 1e-3
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    colours = scene.inputs[4]
+    inputs = (means, quats, scales, torch.full((n,), OPACITY), colours, torch.eye(4))
+    return replace(scene, inputs=inputs)
+
+
+def measure_blend_limit(isa: str) -> BlendLimit:
+    """By the kernels of ``isa``, on one thread; their own clock, the fastest of ATTEMPTS."""
+    renderer, scene = CpuRenderer(1, isa), covering_scene()
+    leaves, fastest = scene.leaves(), {FORWARD_STAGE: float("inf"), BACKWARD_STAGE: float("inf")}
+    with torch_threads(1):
+        for _ in range(ATTEMPTS):
+            drawn = scene.drawn_by(renderer, leaves)
+            torch.autograd.grad([drawn.image, drawn.alpha], leaves, [scene.g_image, scene.g_alpha])
+            stages = renderer.stage_ms()
+            fastest = {name: min(ms, stages[name]) for name, ms in fastest.items()}
+    pairs = COVERING.n * COVERING.pixels
+    forward, backward = (1e-3 * fastest[name] for name in (FORWARD_STAGE, BACKWARD_STAGE))
+    return BlendLimit(pairs / forward, pairs / backward)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from aquaflow.lab.bench.render.blend_limit import BlendLimit
+from aquaflow.lab.bench.render.contenders import BlendLimit
 from aquaflow.render.native import build
 
 VECTOR_BYTES = {"avx512": 64, "avx2": 32, "sse4": 16, "neon": 16}

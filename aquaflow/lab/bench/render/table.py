@@ -11,6 +11,7 @@ from rich.table import Table
 from aquaflow.lab.bench.render.interactions import BACKWARD_FLOP, FORWARD_FLOP
 from aquaflow.lab.bench.render.rows import Row
 from aquaflow.lab.bench.summary import Spread
+from aquaflow.render.example_scene import Size
 
 UNKNOWN = "-"
 """Printed where there is no number."""
@@ -136,3 +137,14 @@ def sentences(result: dict[str, Any]) -> list[str]:
     if not any(row["stage_ms"] for row in result["rows"]):
         said.append("No stages: none of these renderers reports the time of its stages.")
     return [*said, *result["notes"]]
+
+
+# --------------------------------------------------------------------------------------------------
+# The sizes of the scenes that `aquaflow lab bench render` draws.
+
+COUNTS = (10_000, 30_000, 100_000, 300_000)
+PICTURES = ((320, 240), (640, 480), (1280, 720))
+SIZES = tuple(Size(n, *picture) for picture in PICTURES for n in COUNTS)
+"""Numbers of Gaussians, sizes of pictures, and each with each."""
+QUICK_SIZES = (Size(30_000, 320, 240), Size(100_000, 640, 480))
+"""Those of the renderer's bars."""

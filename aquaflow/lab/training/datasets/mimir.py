@@ -14,7 +14,6 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_mapping
-from aquaflow.lab.training.datasets.openexr import read_exr
 from aquaflow.lab.training.datasets.posed import (
     NED_TO_OPTICAL,
     Array,
@@ -25,6 +24,7 @@ from aquaflow.lab.training.datasets.posed import (
     read_image,
     table,
 )
+from aquaflow.lab.training.datasets.tartanair import read_exr
 
 APART_NS = 20_000_000
 """A picture has the pose of this moment at most before or after it: poses come at 30 to 210 Hz."""

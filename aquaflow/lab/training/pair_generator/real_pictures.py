@@ -16,9 +16,9 @@ import torch
 
 from aquaflow.base.errors import InputError
 from aquaflow.lab.training.pair_generator.cameras import intrinsics
-from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.drawing import turned_view
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.scene import rotation
-from aquaflow.lab.training.pair_generator.second_view import turned_view
 from aquaflow.lab.training.pairs import Pair, ViewBatch
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

@@ -8,10 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.noise import periodic, spectral, wrap
-from aquaflow.lab.training.pair_generator.regular import regular_albedo
-from aquaflow.lab.training.pair_generator.texture import Atlas, albedo, atlas
+from aquaflow.lab.training.pair_generator.noise import Draw, periodic, spectral, stamp, wrap
 
 ROCKS = 10
 """Stamps on the floor, at most."""
@@ -200,3 +197,201 @@ def rotation(
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
     R: Tensor = torch.linalg.matrix_exp(torch.stack([torch.stack(r, -1) for r in rows], -2))
     return R
+
+
+# --------------------------------------------------------------------------------------------------
+# Albedo that repeats itself: tiled floors, brickwork and nets, unlike only by their dirt.
+#
+# Their cells are alike, so that only what lies around a cell says which one it is.
+
+CELLS = (3, 14)
+"""Half the number of cells along a period; a whole even number of them keeps it periodic."""
+JOINT = (0.04, 0.2)
+"""Width of a joint or a twine, as a share of its cell."""
+SAG = 0.15
+"""Deviation of a net's displacement, in cells."""
+NETS = 0.35
+"""Share of nets; the others are tiles and bricks."""
+
+
+def regular_albedo(draw: Draw, batch: int, size: int) -> Tensor:
+    """[B, 3, size, size] in [0, 1], periodic."""
+    count = 2.0 * (draw.whole(batch, 1, 1, below=CELLS[1] - CELLS[0]) + CELLS[0])
+    is_net = draw.chance(NETS, batch, 1, 1)
+    u, v = _places(draw, count, is_net, size)
+    joint = draw.log_uniform(batch, 1, 1, low=JOINT[0], high=JOINT[1])
+    soft = count / size
+    lines = torch.maximum(_line(u, joint, soft), _line(v, joint, soft))
+    tile = _cell_values(draw, u, v, count)
+    dirt = spectral(draw, size, draw.uniform(batch, low=1.2, high=2.6))
+    dirt = 1.0 + draw.log_uniform(batch, 1, 1, low=0.02, high=0.25) * dirt
+    colours = draw.uniform(2, batch, 3, 1, 1, low=0.05, high=0.9)
+    colours = colours.mean(2, keepdim=True).lerp(colours, draw.uniform(batch, 1, 1, 1))
+    # Behind a net there is open water or a dim background, and nothing that belongs to a cell.
+    background = torch.where(is_net, 0.3 * dirt, tile * dirt)[:, None]
+    result = (colours[0] * background).lerp(colours[1] * dirt[:, None], lines[:, None])
+    growth = stamp(
+        draw,
+        size,
+        draw.log_uniform(batch, low=1e-5, high=3e-4),
+        draw.log_uniform(batch, low=2.0, high=9.0),
+        torch.zeros(batch, device=draw.device),
+    )[:, None]
+    thing = draw.uniform(batch, 3, 1, 1, low=0.05, high=0.7)
+    return result.lerp(thing * dirt[:, None], growth).clamp(0.01, 1.0)
+
+
+def _places(
+    draw: Draw,
+    count: Tensor,  # [B, 1, 1]
+    is_net: Tensor,  # [B, 1, 1] bool
+    size: int,
+) -> tuple[Tensor, Tensor]:
+    """[B, size, size] along and across, in cells: straight, every second row shifted by half a
+    cell, or for nets along the diagonals and sagging."""
+    batch = len(count)
+    axis = (torch.arange(size, device=draw.device) + 0.5) / size
+    x = (axis[None, None] * count).expand(-1, size, -1)
+    y = (axis[None, :, None] * count).expand(-1, -1, size)
+    brick = draw.chance(0.3, batch, 1, 1) * 0.5
+    straight = (x + brick * (y.floor() % 2.0), y)
+    sag = [SAG * spectral(draw, size, torch.full((batch,), 3.5, device=draw.device)) for _ in "uv"]
+    diagonal = draw.chance(0.5, batch, 1, 1)
+    net = (
+        torch.where(diagonal, x + y, x) + sag[0],
+        torch.where(diagonal, x - y, y) + sag[1],
+    )
+    return torch.where(is_net, net[0], straight[0]), torch.where(is_net, net[1], straight[1])
+
+
+def _line(
+    place: Tensor,  # [B, n, n] in cells
+    width: Tensor,  # [B, 1, 1] in cells
+    soft: Tensor,  # [B, 1, 1] cells to a texel
+) -> Tensor:
+    """[B, n, n] in [0, 1], 1 on the cells' borders."""
+    away = 0.5 - (place - place.floor() - 0.5).abs()
+    return ((0.5 * width - away) / soft + 0.5).clamp(0.0, 1.0)
+
+
+def _cell_values(
+    draw: Draw,
+    u: Tensor,  # [B, n, n]
+    v: Tensor,  # [B, n, n]
+    count: Tensor,  # [B, 1, 1]
+) -> Tensor:
+    """[B, n, n] brightness of each cell: nearly alike, a few of another glaze."""
+    batch, most = len(count), 2 * CELLS[1]
+    shade = 1.0 + draw.normal(batch, most * most) * draw.uniform(batch, 1, high=0.06)
+    other = draw.uniform(batch, most * most) < draw.uniform(batch, 1, high=0.12)
+    shade = torch.where(other, shade * draw.uniform(batch, 1, low=0.4, high=1.5), shade)
+    column, row = ((x.floor() % count).long().clamp(0, most - 1) for x in (u, v))
+    return shade.gather(1, (row * most + column).flatten(1)).view_as(u)
+
+
+# --------------------------------------------------------------------------------------------------
+# Albedo of floors and structures, with a pyramid so that nothing flickers with distance.
+
+LEVELS = 7
+"""Of the pyramid; the coarsest has 1/64 of the texels along a side."""
+SHARPNESS = 0.7
+"""Share of a pixel's width that is averaged: lenses are sharper than a full pixel's mean."""
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Pyramids of several periodic textures in one picture, so that a lookup is one gather."""
+
+    picture: Tensor
+    """[B, 3, rows, columns]; each level has its first row and column once more"""
+    size: int
+    """Texels along a side of the finest level."""
+    row: Tensor
+    """[LEVELS] first row of each level."""
+
+    @property
+    def width(self) -> int:
+        """Columns that one texture takes."""
+        return self.size + 1
+
+    def albedo(
+        self,
+        places: Tensor,  # [B, N, 2] in periods
+        footprint: Tensor,  # [B, N] periods that a pixel covers
+        material: Tensor,  # [B, N] int64, which texture
+    ) -> Tensor:
+        """[B, 3, N] trilinear."""
+        level = torch.log2((footprint * self.size * SHARPNESS).clamp_min(1.0))
+        level = level.clamp_max(LEVELS - 1.001)
+        fine = level.floor()
+        near = self._level(places, fine.long(), material)
+        far = self._level(places, fine.long() + 1, material)
+        return near + (far - near) * (level - fine)[:, None]
+
+    def _level(
+        self,
+        places: Tensor,  # [B, N, 2] in periods
+        level: Tensor,  # [B, N] int64
+        material: Tensor,  # [B, N] int64
+    ) -> Tensor:
+        scale = torch.exp2(level.float())[..., None]
+        # The mean of 2^l texels lies at their middle, not at the first of them.
+        places = places - (scale - 1.0) / (2.0 * self.size)
+        inside = (places - places.floor()) * (self.size / scale)
+        x = inside[..., 0] + (material * self.width).float()
+        y = inside[..., 1] + self.row.to(level.device)[level].float()
+        rows, columns = self.picture.shape[-2:]
+        grid = torch.stack([x / (columns - 1), y / (rows - 1)], -1) * 2.0 - 1.0
+        return F.grid_sample(self.picture, grid[:, :, None], mode="bilinear", align_corners=True)[
+            ..., 0
+        ]
+
+
+def atlas(
+    textures: list[Tensor],  # each [B, 3, n, n] periodic
+) -> Atlas:
+    """The pyramids of all textures, side by side."""
+    size = textures[0].shape[-1]
+    columns = []
+    for texture in textures:
+        level, stack = texture, []
+        for _ in range(LEVELS):
+            padded = F.pad(level, (0, 1, 0, 1), mode="circular")
+            stack.append(F.pad(padded, (0, size + 1 - padded.shape[-1], 0, 0)))
+            level = F.avg_pool2d(level, 2)
+        columns.append(torch.cat(stack, -2))
+    heights = torch.tensor([0] + [(size >> level) + 1 for level in range(LEVELS - 1)])
+    return Atlas(torch.cat(columns, -1), size, heights.cumsum(0))
+
+
+def albedo(draw: Draw, batch: int, size: int) -> Tensor:
+    """[B, 3, size, size] in [0, 1]: three colours of growth, cracks, and things strewn about."""
+    fine = spectral(draw, size, draw.uniform(batch, low=0.6, high=1.9))
+    blobs = spectral(draw, size, draw.uniform(batch, low=0.6, high=1.9))
+    patches = spectral(draw, size, draw.uniform(batch, low=1.6, high=2.6))
+    colours = draw.uniform(3, batch, 3, 1, 1, low=0.05, high=0.85)
+    # Most of nature is near grey; the water makes the colours.
+    colours = colours.mean(2, keepdim=True).lerp(colours, draw.uniform(batch, 1, 1, 1))
+    contrast = draw.log_uniform(batch, 1, 1, low=0.1, high=0.5)
+    threshold = draw.uniform(batch, 1, 1, high=2.0)
+    sharpness = draw.uniform(batch, 1, 1, low=2.0, high=10.0)
+    speckles = torch.sigmoid((blobs - threshold) * sharpness)[:, None]
+    growth = 0.6 * torch.sigmoid((patches - 0.3) * sharpness)[:, None]
+    ground = (1.0 + contrast * fine)[:, None]
+    result = (colours[0] * ground).lerp(
+        colours[1] * (1.0 + 0.3 * contrast * patches)[:, None], speckles
+    )
+    result = result.lerp(colours[2] * ground, growth)
+    cracks = torch.exp(
+        -draw.uniform(batch, 1, 1, low=6.0, high=25.0) * blobs.roll(size // 3, 1).abs()
+    )
+    result = result * (1.0 - draw.uniform(batch, 1, 1, high=0.7) * cracks)[:, None]
+    strewn = stamp(
+        draw,
+        size,
+        draw.log_uniform(batch, low=3e-5, high=3e-3),
+        draw.log_uniform(batch, low=1.5, high=12.0),
+        draw.uniform(batch, low=-1.0, high=0.9).clamp_min(0.0),
+    )[:, None]
+    thing = draw.uniform(batch, 3, 1, 1, low=0.05, high=0.95)
+    return result.lerp(thing * ground, strewn * draw.uniform(batch, 1, 1, 1)).clamp(0.01, 1.0)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.noise import Draw
 
 MEAN_LEVEL = (0.25, 0.55)
 """That automatic exposure aims at."""

@@ -14,7 +14,10 @@ import torch
 from torch import Tensor
 
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.lab.training.pair_generator.render import BRIGHTEST
+from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
+from aquaflow.lab.training.pair_generator.noise import Draw
+from aquaflow.lab.training.pair_generator.render import BRIGHTEST, render_pairs
+from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pairs import Pair, ViewBatch
 
 SHARD = 8
@@ -94,3 +97,26 @@ def _view(
     depth = stacked[f"depth_{name}"].float()
     image = stacked[f"image_{name}"].float() * (BRIGHTEST / 255.0)
     return ViewBatch(image, depth.abs(), stacked[f"K_{name}"], stacked[f"T_wc_{name}"], depth > 0)
+
+
+# --------------------------------------------------------------------------------------------------
+# The pool of generated scenes, each rendered once and used many times.
+
+
+@dataclass
+class Pool(StoredPairs):
+    """Generated pairs; a shard's content follows from the pool's seed and its number."""
+
+    seed: int
+    width: int = 192
+    height: int = 144
+    motion: PairMotion = TRAINING
+    detail: Detail = field(default_factory=Detail)
+
+    @property
+    def name(self) -> str:
+        return f"pairs_{self.width}x{self.height}_{self.seed}"
+
+    def render(self, shard: int) -> Pair:
+        draw = Draw(self.seed * STRIDE + shard)
+        return render_pairs(draw, SHARD, self.width, self.height, self.motion, self.detail)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.lab.synthetic.water import WATER_TYPES
-from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pairs import ViewBatch
 
 MEDIAN_RANGE_M = (0.6, 6.0)

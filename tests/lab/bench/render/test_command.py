@@ -16,12 +16,16 @@ from aquaflow.base.errors import InputError
 from aquaflow.cli import app
 from aquaflow.lab.bench.render import benchmark as bm
 from aquaflow.lab.bench.render import peak as peaks
-from aquaflow.lab.bench.render import sizes
-from aquaflow.lab.bench.render.contenders import Timed, contenders_here, thread_counts
-from aquaflow.lab.bench.render.opensplat import NOTE, OpenSplat
+from aquaflow.lab.bench.render import table as sizes
+from aquaflow.lab.bench.render.contenders import (
+    NOTE,
+    OpenSplat,
+    Timed,
+    contenders_here,
+    thread_counts,
+)
 from aquaflow.lab.bench.render.parts import parts_of
-from aquaflow.lab.bench.render.sizes import SIZES
-from aquaflow.lab.bench.render.table import print_result
+from aquaflow.lab.bench.render.table import SIZES, print_result
 from aquaflow.render.example_scene import NAMES, SMALL, Size, height_field
 from aquaflow.render.native.build import supported_isas
 from tests.command_line import refused, run_aquaflow

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from aquaflow.lab.bench.render import peak as peaks
-from aquaflow.lab.bench.render.blend_limit import (
+from aquaflow.lab.bench.render.contenders import (
     COVERING,
     BlendLimit,
+    Timed,
     covering_scene,
     measure_blend_limit,
 )
-from aquaflow.lab.bench.render.contenders import Timed
 from aquaflow.lab.bench.render.interactions import count_interactions
 from aquaflow.lab.bench.render.parts import parts_of, time_parts
 from aquaflow.lab.bench.render.rows import row_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.lab.evaluation.water_peers import grey_world
+from aquaflow.lab.evaluation.water_peers import contract as grey_world
 from aquaflow.lab.evaluation.water_peers.contract import NotRestoredError
 
 

@@ -14,7 +14,7 @@ from aquaflow.lab.training.pair_generator.cameras import (
     first_camera,
     second_camera,
 )
-from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.scene import Detail, random_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -8,28 +8,27 @@ from dataclasses import fields
 import pytest
 import torch
 
-from aquaflow.lab.training.correspondences import correspondences
-from aquaflow.lab.training.pair_generator.bodies import with_bodies
 from aquaflow.lab.training.pair_generator.cameras import TRAINING
 from aquaflow.lab.training.pair_generator.conditions import (
     CALM,
     Conditions,
     in_low_light,
+    with_bodies,
     with_caustics,
     with_motion_blur,
+    with_overlay,
     with_snow,
 )
-from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import (
     WindowVariation,
     through_water,
     training_pair,
 )
-from aquaflow.lab.training.pair_generator.overlays import with_overlay
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.render import render_pairs
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.water import random_water, turbidity
-from aquaflow.lab.training.pairs import Pair, ViewBatch
+from aquaflow.lab.training.pairs import Pair, ViewBatch, correspondences
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -10,20 +10,19 @@ from torch.nn import functional as F
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.lab.training.correspondences import correspondences, overlap
 from aquaflow.lab.training.pair_generator import map_pairs
-from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.map_pairs import (
     ATTEMPTS,
     LEAST_COVERED,
     LEAST_OVERLAP,
     MapPairs,
+    MappedScene,
     drawn_pair,
     widest_view_deg,
 )
-from aquaflow.lab.training.pair_generator.mapped_scene import MappedScene
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
-from aquaflow.lab.training.pairs import Pair, join
+from aquaflow.lab.training.pairs import Pair, correspondences, join, overlap
 from tests.lab.training.small_maps import small_dive
 from tests.mapping.mapping_scenes import FLOOR_M, path, pose
 

@@ -8,21 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from aquaflow.lab.training.correspondences import overlap
 from aquaflow.lab.training.pair_generator.cameras import TRAINING
-from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import (
     WindowVariation,
     through_water,
     training_pair,
 )
-from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.render import BRIGHTEST, median_depth, render_pairs
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.sensor import take_picture
-from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE
+from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE, Pool
 from aquaflow.lab.training.pair_generator.water import MOST_ATTENUATION, random_water
-from aquaflow.lab.training.pairs import Pair
+from aquaflow.lab.training.pairs import Pair, overlap
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

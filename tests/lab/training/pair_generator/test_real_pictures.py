@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.training.correspondences import correspondences
-from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.real_pictures import FRAMES_OF_A_CLIP, RealPictures
+from aquaflow.lab.training.pairs import correspondences
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.regular import regular_albedo
-from aquaflow.lab.training.pair_generator.scene import FLATTENED, Detail, random_scenes
+from aquaflow.lab.training.pair_generator.noise import Draw
+from aquaflow.lab.training.pair_generator.scene import (
+    FLATTENED,
+    Detail,
+    random_scenes,
+    regular_albedo,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -9,19 +9,22 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.lab.training.correspondences import correspondences
 from aquaflow.lab.training.pair_generator.cameras import (
     TRAINING,
     first_camera,
     intrinsics,
     second_camera,
 )
-from aquaflow.lab.training.pair_generator.draw import Draw
-from aquaflow.lab.training.pair_generator.march import first_hits
-from aquaflow.lab.training.pair_generator.render import median_depth, render_pairs, render_view
+from aquaflow.lab.training.pair_generator.drawing import turned_view
+from aquaflow.lab.training.pair_generator.noise import Draw
+from aquaflow.lab.training.pair_generator.render import (
+    first_hits,
+    median_depth,
+    render_pairs,
+    render_view,
+)
 from aquaflow.lab.training.pair_generator.scene import Detail, SceneBatch, random_scenes, rotation
-from aquaflow.lab.training.pair_generator.second_view import turned_view
-from aquaflow.lab.training.pairs import Pair, ViewBatch, seen_from
+from aquaflow.lab.training.pairs import Pair, ViewBatch, correspondences, seen_from
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
