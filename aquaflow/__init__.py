@@ -19,7 +19,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from aquaflow.api.map import Map, load_map, map_recording
+    from aquaflow.api.map import Map, load_map
+    from aquaflow.api.recording import map_recording
     from aquaflow.base.errors import AquaFlowError
     from aquaflow.config import Config
     from aquaflow.dive.dive import Dive, read_dive
@@ -69,7 +70,7 @@ _HOMES = {
     "associate": "aquaflow.dive.tum",
     "guess_camera": "aquaflow.geometry.camera",
     "load_map": "aquaflow.api.map",
-    "map_recording": "aquaflow.api.map",
+    "map_recording": "aquaflow.api.recording",
     "read_dive": "aquaflow.dive.dive",
     "read_tum": "aquaflow.dive.tum",
 }

@@ -159,7 +159,7 @@ def map_command(
     from aquaflow.base.errors import InputError
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
-    from aquaflow.sources.newest import open_telemetry
+    from aquaflow.sources.telemetry_input import open_telemetry
 
     calibration = None if calib is None else load_camera(calib)
     if realtime and telemetry:

@@ -168,7 +168,7 @@ def inspect(
 
 
 def _pictures(recording: RecordedCamera) -> dict[str, Any]:
-    from aquaflow.sources.preprocessing import oddities
+    from aquaflow.sources.picture_check import oddities
     from aquaflow.types import Frame
 
     read = list(islice(recording.frames(), MOST_FRAMES))

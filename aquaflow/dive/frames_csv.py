@@ -10,7 +10,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text, read_regular
-from aquaflow.base.storage.spill import csv_text, text_of_cell
+from aquaflow.base.storage.table import csv_text, text_of_cell
 
 MOST_LINES = 20
 """Lines of one reason; a library's message has a few."""

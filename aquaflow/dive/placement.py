@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.alignment import latitude_longitude
+from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.telemetry.world_frame import Origin, WorldFrame

@@ -40,7 +40,8 @@ from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
 from aquaflow.slam.slam import FinishTime
-from aquaflow.sources.preprocessing import Preparation, oddities
+from aquaflow.sources.picture_check import oddities
+from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample

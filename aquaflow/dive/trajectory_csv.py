@@ -14,7 +14,7 @@ from pathlib import Path
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.base.storage.spill import csv_text
+from aquaflow.base.storage.table import csv_text
 
 NAME = "trajectory.csv"
 DECIMALS = {"t_s": 9, "latitude_deg": 9, "longitude_deg": 9, "x": 6, "y": 6, "z": 6}

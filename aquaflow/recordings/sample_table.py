@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.base.storage.spill import csv_text
+from aquaflow.base.storage.table import csv_text
 from aquaflow.types import KIND_OF, KINDS, LENGTHS, VALUES, TelemetrySample, values_of
 
 __all__ = ["HEADER", "read_telemetry", "sample_of", "write_telemetry"]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
 from aquaflow.config.stage import MountingConfig
-from aquaflow.geometry.alignment import north_east
+from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.stage import MountingConfig
-from aquaflow.geometry.alignment import align, north_east
+from aquaflow.geometry.alignment import align
+from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import (
     BODY_FROM_CAMERA,
     Sim3,

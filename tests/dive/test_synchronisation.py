@@ -17,7 +17,7 @@ from aquaflow.dive.run import DiveRun
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.images import SUBFOLDER
 from aquaflow.sources import RecordedTelemetry
-from aquaflow.sources.newest import TelemetryInput, open_telemetry
+from aquaflow.sources.telemetry_input import TelemetryInput, open_telemetry
 from aquaflow.types import AngularRate, Depth, TelemetrySample
 from tests.command_line import Cli, refused
 from tests.small_recording import HASTY

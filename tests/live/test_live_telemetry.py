@@ -24,7 +24,7 @@ from aquaflow.live.live_dive import LiveDive
 from aquaflow.recordings.playback import Event, Playback
 from aquaflow.recordings.telemetry_lines import TelemetryLines, TelemetryWriter
 from aquaflow.sources import mounting_of, open_recording
-from aquaflow.sources.newest import TelemetryInput, open_telemetry
+from aquaflow.sources.telemetry_input import TelemetryInput, open_telemetry
 from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.types import Altitude, Depth, Dropped, Frame, Position, UtcTime, Velocity
 from tests.live.live_scenes import VEHICLE, ToldFeed, caught_up

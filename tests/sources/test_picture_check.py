@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.sources.preprocessing import oddities
+from aquaflow.sources.picture_check import oddities
 
 Pictures = list[npt.NDArray[np.uint8]]
 rng = np.random.default_rng(0)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
-from aquaflow.geometry.alignment import latitude_longitude
+from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from

@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
-from aquaflow.geometry.alignment import align, latitude_longitude, north_east
+from aquaflow.geometry.alignment import align
+from aquaflow.geometry.earth import latitude_longitude, north_east
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.estimator import Estimate, estimate
 from aquaflow.telemetry.telemetry import Telemetry

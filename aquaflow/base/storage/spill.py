@@ -6,20 +6,16 @@ An item is read back bit for bit, so a map does not depend on which items were i
 from __future__ import annotations
 
 import contextlib
-import csv
 import ctypes
 import errno
-import io
 import logging
 import os
-import re
 import shutil
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from aquaflow.base.errors import printable_text
 from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.archive import Arrays, read_arrays, write_arrays
 from aquaflow.base.storage.atomic import open_to_append
@@ -244,38 +240,3 @@ def read_item(path: Path) -> Arrays:
 def _owner(path: Path) -> str:
     """Folder and number, which each file contains so that a misplaced file is detected."""
     return f"{path.parent.name}/{path.stem}"
-
-
-# --------------------------------------------------------------------------------------------------
-# Tables as CSV (RFC 4180) that a spreadsheet opens without running what stands in them.
-#
-# A spreadsheet takes a cell that starts with ``=``, ``+``, ``-`` or ``@`` for a formula, and a
-# picture may be named ``=HYPERLINK(...)`` (OWASP, "CSV Injection"). Such a text gets an apostrophe
-# before it, also after a semicolon, which separates cells where the comma is the decimal sign;
-# numbers stay. Control characters become text, as ``printable_text`` has them.
-
-_FORMULA = r"(?='*[=+\-@\t\n＝＋－＠])"
-"""What begins a formula, or another cell; a text with apostrophes of its own gets one more."""
-_BEFORE = re.compile(r"(^|[;\t\n])" + _FORMULA)
-_WRITTEN = re.compile(r"(^|[;\t\n])'" + _FORMULA)
-
-
-def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """The lines of a table, each ended by a line feed."""
-    text = io.StringIO(newline="")
-    lines = ([_harmless(str(cell)) for cell in row] for row in rows)
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()
-
-
-def text_of_cell(cell: str) -> str:
-    """The text that :func:`csv_text` was given for a cell."""
-    return _WRITTEN.sub(r"\1", cell)
-
-
-def _harmless(cell: str) -> str:
-    try:
-        float(cell)
-    except ValueError:
-        return _BEFORE.sub(r"\1'", printable_text(cell))
-    return cell

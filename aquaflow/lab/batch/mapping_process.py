@@ -46,7 +46,7 @@ def map_one(asked: dict[str, Any]) -> dict[str, Any]:
     from aquaflow.config import parse_config
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
-    from aquaflow.sources.newest import open_telemetry
+    from aquaflow.sources.telemetry_input import open_telemetry
 
     settings = parse_config(asked["settings"], "batch")
     source = Path(asked["source"])

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.spill import text_of_cell
+from aquaflow.base.storage.table import text_of_cell
 from aquaflow.dive.dive import FRAMES, Dive
 from aquaflow.dive.tum import Trajectory
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.spill import csv_text
+from aquaflow.base.storage.table import csv_text
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.change_picture import change_png, write_change_raster

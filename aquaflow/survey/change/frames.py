@@ -10,7 +10,7 @@ from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import to_geodetic
-from aquaflow.geometry.alignment import north_east
+from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive, read_site
 from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of

@@ -16,7 +16,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
-from aquaflow.geometry.alignment import north_east
+from aquaflow.geometry.earth import north_east
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.measure.height_field import HeightField

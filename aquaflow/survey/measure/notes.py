@@ -20,7 +20,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
-from aquaflow.geometry.alignment import from_geodetic, geodetic
+from aquaflow.geometry.earth import from_geodetic, geodetic
 from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]

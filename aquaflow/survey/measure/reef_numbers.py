@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.base.storage.spill import csv_text
+from aquaflow.base.storage.table import csv_text
 from aquaflow.survey.coverage.footprint import VISIBLE_CONTRAST
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.survey.measure.areas import WELL_SEEN, areas, way

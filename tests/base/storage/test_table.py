@@ -7,7 +7,7 @@ import io
 
 import pytest
 
-from aquaflow.base.storage.spill import csv_text, text_of_cell
+from aquaflow.base.storage.table import csv_text, text_of_cell
 
 FORMULAS = [
     '=HYPERLINK("http://example.org","x").png',

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.geometry.alignment import north_east
+from aquaflow.geometry.earth import north_east
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.relief import Area
 from aquaflow.lab.synthetic.telemetry.altitude import altitude

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.geometry.alignment import latitude_longitude
+from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.survey.measure.notes import (
     MOST_NOTES,
     NAME,

@@ -11,7 +11,7 @@ import numpy as np
 
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.stages import pace
-from aquaflow.base.storage.spill import csv_text
+from aquaflow.base.storage.table import csv_text
 from aquaflow.config import Config
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import load_camera

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.alignment import latitude_longitude
+from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.series import choose
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
