@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 
 DIALECT = "pymavlink.dialects.v20.ardupilotmega"
 """ArduPilot's messages; they include the common ones, which PX4 sends too."""

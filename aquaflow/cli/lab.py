@@ -196,9 +196,9 @@ def batch(
     as_json: Json = False,
 ) -> None:
     """Map many recordings, each into a dive of its own; go on where an earlier batch ended."""
-    from aquaflow.config.batch import BatchConfig
     from aquaflow.config.presets import load_configured
     from aquaflow.config.stage import validate
+    from aquaflow.lab.batch.job import BatchConfig
 
     settings = load_configured(
         config,

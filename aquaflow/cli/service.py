@@ -110,7 +110,7 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Ask the running service how it is; exit code 0 only if nothing is to be done about it."""
-    from aquaflow.live.health.client import ask
+    from aquaflow.live.health.http import ask
     from aquaflow.web.access import read_token
 
     report = ask(url, None if token_file is None else read_token(token_file))

@@ -24,7 +24,6 @@ from aquaflow.config.mapping import (
     VoxelConfig,
     WaterPriorsConfig,
 )
-from aquaflow.config.prior import PriorConfig
 from aquaflow.config.service import CoverageConfig
 from aquaflow.config.stage import StageConfig, understood, validate, without_old_keys
 from aquaflow.config.telemetry import FusionConfig
@@ -33,6 +32,7 @@ from aquaflow.config.tracking import (
     GraphConfig,
     InitialisationConfig,
     MonitorConfig,
+    PriorConfig,
     RetrievalConfig,
     TrackingConfig,
     VerificationConfig,

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 def water_in_numbers(mapper: Mapper, most_views: int | None = None) -> WaterSummary | None:
-    """See :func:`aquaflow.dive.water_summary.summarise_water`; None: as many views as there."""
-    from aquaflow.dive import water_summary
+    """See :func:`aquaflow.dive.map_file.summarise_water`; None: as many views as there."""
+    from aquaflow.dive import map_file
 
-    return water_summary.summarise_water(mapper, most_views or water_summary.RANGE_VIEWS)
+    return map_file.summarise_water(mapper, most_views or map_file.RANGE_VIEWS)
 
 
 def held_out_examples(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
@@ -53,9 +53,9 @@ def write_splats(
 
 
 def attenuations(mappers: Mapping[int, Mapper]) -> dict[int, list[float]]:
-    """See :func:`aquaflow.dive.water_summary.attenuations`; without a map none."""
+    """See :func:`aquaflow.dive.map_file.attenuations`; without a map none."""
     if not mappers:
         return {}
-    from aquaflow.dive import water_summary
+    from aquaflow.dive import map_file
 
-    return water_summary.attenuations(mappers)
+    return map_file.attenuations(mappers)

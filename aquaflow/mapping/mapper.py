@@ -28,14 +28,14 @@ from aquaflow.mapping.gaussians import (
     worth_keeping,
 )
 from aquaflow.mapping.neural.neural import NeuralGaussians
-from aquaflow.mapping.optimisation.map_optimiser import (
+from aquaflow.mapping.optimisation import (
     MapOptimiser,
     Objective,
     refining_rates,
+    register,
     sampled_views,
     shuffled_views,
 )
-from aquaflow.mapping.optimisation.registration import register
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.mapping.scene_water import WaterFitting, rebalance
 from aquaflow.render.contract import Renderer

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.worker import core_count
-from aquaflow.config.prior import PriorConfig
+from aquaflow.config.tracking import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior

@@ -31,8 +31,7 @@ from aquaflow.prior.contract import Encoding
 from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.table import Snapshot
-from aquaflow.tracking.loops.relocaliser import Retrieval
-from aquaflow.tracking.loops.verification import Verified, verify_keypoints
+from aquaflow.tracking.loops import Retrieval, Verified, verify_keypoints
 from aquaflow.tracking.metric.measured import World, WorldEdge
 
 STAGE = "look-up in the base"

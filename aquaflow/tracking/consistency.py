@@ -24,7 +24,7 @@ from aquaflow.geometry.two_view import pose_candidates
 from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.optimise.robust import sigma_of
 from aquaflow.prior.contract import PairGeometry
-from aquaflow.tracking.loops.verification import Neighbour, Neighbours, sketch
+from aquaflow.tracking.loops import Neighbour, Neighbours, sketch
 from aquaflow.tracking.pose.matcher import Matched
 
 REMEMBERED = 20

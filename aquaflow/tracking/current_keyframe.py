@@ -25,7 +25,7 @@ from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.tracking.learned.moving import SeenBefore, moving
 from aquaflow.tracking.learned.scaling import LearnedDepth, add_learned
-from aquaflow.tracking.loops.verification import Neighbour, Neighbours
+from aquaflow.tracking.loops import Neighbour, Neighbours
 from aquaflow.tracking.pose.depth_fusion import fuse, transfer
 from aquaflow.tracking.pose.matcher import (
     KeyframeMatcher,

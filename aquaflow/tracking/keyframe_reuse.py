@@ -16,7 +16,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.loops.verification import Neighbour
+from aquaflow.tracking.loops import Neighbour
 from aquaflow.tracking.pose.matcher import Matched, expected_matches
 
 STAGE = "return to a keyframe"

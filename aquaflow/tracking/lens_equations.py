@@ -22,7 +22,7 @@ from aquaflow.geometry.similarity import Sim3, hat, so3_exp
 from aquaflow.optimise.least_squares import NormalEquations, Rules, minimise
 from aquaflow.optimise.robust import HUBER_LENGTH, Huber, sigma_of_lengths
 from aquaflow.prior.contract import Keypoints, Mask
-from aquaflow.tracking.loops.verification import Index, match_keypoints
+from aquaflow.tracking.loops import Index, match_keypoints
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -18,15 +18,23 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Quality, Revisit, Step, Tracked
+from aquaflow.tracking.frames import (
+    FrameClass,
+    KeyframeEdge,
+    Quality,
+    Revisit,
+    Step,
+    Tracked,
+    Wait,
+    WaitingFrames,
+)
 from aquaflow.tracking.initialisation.back_fill import BackFillResult, BackFills
 from aquaflow.tracking.keyframe_reuse import STAGE as RETURN
 from aquaflow.tracking.keyframe_reuse import KeyframeReuse, ReuseResult, carry
-from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.loops import Places
 from aquaflow.tracking.map_start import MapStart, NewMap
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs, find_revisit
-from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 
 log = logging.getLogger(__name__)

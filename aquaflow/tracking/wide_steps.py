@@ -22,7 +22,7 @@ from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.prior.contract import Encoding, Mask, PairGeometry, Prior
 from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.homography import flow_of_homography, homography
-from aquaflow.tracking.loops.verification import match_keypoints
+from aquaflow.tracking.loops import match_keypoints
 from aquaflow.tracking.pose.depth_fusion import fuse
 from aquaflow.tracking.pose.matcher import (
     KeyframeMatcher,

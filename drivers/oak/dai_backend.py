@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
 from aquaflow.geometry.camera import DistortionModel

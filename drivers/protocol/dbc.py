@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from aquaflow.base.errors import ConfigError, reason_of
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import ConfigError, load, reason_of
 from aquaflow.config.instruments import DbcConfig, DbcSignal
 from aquaflow.drivers.fixes import Fixes, Vector, from_euler, normalise, sigma_of
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.config.link import (
     CanConfig,
     Mavlink2restConfig,

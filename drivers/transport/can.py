@@ -9,7 +9,7 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.config.link import CanConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
 

@@ -17,7 +17,7 @@ from itertools import cycle
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 from urllib.parse import quote, urlsplit
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.config.link import Mavlink2restConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError, about
 from aquaflow.drivers.mavlink_dialect import dialect

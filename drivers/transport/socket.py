@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.config.link import SerialConfig, TcpConfig, UdpConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
 from aquaflow.sources.newest import Newest

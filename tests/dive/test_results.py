@@ -8,13 +8,13 @@ import torch
 
 from aquaflow.config import Config
 from aquaflow.dive.held_out_example import HeldOut
+from aquaflow.dive.map_file import water_of
 from aquaflow.dive.results import (
     WaterSummary,
     largest_sub_map,
     metrics,
     refined_poses,
 )
-from aquaflow.dive.water_summary import water_of
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.slam import Slam

@@ -11,8 +11,7 @@ import sys
 import can
 import pytest
 
-from aquaflow.base.errors import InputError
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import InputError, load
 from aquaflow.config.link import CanConfig, SerialConfig, TcpConfig, UdpConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
 from aquaflow.drivers.transport import opener

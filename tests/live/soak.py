@@ -27,8 +27,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.feed import ASK_S, _Pumps
-from aquaflow.live.health.client import ask
-from aquaflow.live.health.http import HealthServer
+from aquaflow.live.health.http import HealthServer, ask
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.report import report

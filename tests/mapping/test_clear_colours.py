@@ -10,8 +10,8 @@ import torch
 
 from aquaflow.config import Config, MappingConfig
 from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.map_file import summarise_water
 from aquaflow.dive.ply import read_ply
-from aquaflow.dive.water_summary import summarise_water
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import (
     drawn_without_water,

@@ -10,7 +10,7 @@ import pytest
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.optimisation.map_optimiser import Rates, refining_rates
+from aquaflow.mapping.optimisation import Rates, refining_rates
 from tests.mapping.mapping_scenes import (
     cloud,
     copied,

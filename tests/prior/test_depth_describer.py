@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.config.prior import PriorConfig
+from aquaflow.config.tracking import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.depth_describer import DepthDescriber

@@ -11,10 +11,9 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking import tracker as tracker_module
-from aquaflow.tracking.frames import FrameClass
+from aquaflow.tracking.frames import BOUNDS, Bound, FrameClass, Wait
 from aquaflow.tracking.initialisation.back_fill import BackFill
 from aquaflow.tracking.tracker import Tracker
-from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from tests.tracking.tracked_clips import (
     PLACED,
     QUICK,

@@ -20,9 +20,16 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Encoding, PairGeometry
 from aquaflow.tracking import map_start
 from aquaflow.tracking.current_keyframe import CurrentKeyframe
-from aquaflow.tracking.frames import FrameClass, Quality, Tracked
+from aquaflow.tracking.frames import (
+    BOUNDS,
+    Bound,
+    FrameClass,
+    Quality,
+    Tracked,
+    Wait,
+    WaitingFrames,
+)
 from aquaflow.tracking.tracker import Tracker
-from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait, WaitingFrames
 from aquaflow.types import Frame
 from tests.tracking.tracked_clips import Prompt
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.service import ListenConfig
-from aquaflow.web import HttpRequest, HttpResponse, WebServer, connection
+from aquaflow.web import HttpRequest, HttpResponse, WebServer
+from aquaflow.web import server as connection
 from aquaflow.web.access import Access
 from tests.small_recording import GIVE_UP_S
 

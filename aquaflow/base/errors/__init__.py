@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import re
 from collections.abc import Iterable
+from importlib import import_module
+from typing import Any
 
 
 class AquaFlowError(Exception):
@@ -172,3 +174,22 @@ def path_of_key(parts: Iterable[object]) -> str:
     """Where a setting stands, as ``mapping.medium.enabled``; what is no name is left out, for a
     file that is no config may have anything before a colon."""
     return ".".join(str(part) if _NAME.fullmatch(str(part)) else "..." for part in parts)
+
+
+# --------------------------------------------------------------------------------------------------
+# Optional libraries: loaded when they are needed; an error of one sentence if missing.
+
+
+def load(module: str, needed_by: str, extra: str = "telemetry") -> Any:
+    """Import ``module``; typed Any, because most such libraries carry no types.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise InputError(
+            f"{needed_by} needs the library {error.name or module}, which is not installed; "
+            f"run `pip install 'aquaflow[{extra}]'`"
+        ) from error

@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.point_cloud import PointCloud
-from aquaflow.dive.ros.frames import FrameTransform
-from aquaflow.dive.ros.topics import constant, message
+from aquaflow.dive.ros.topics import FrameTransform, constant, message
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 

@@ -18,8 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.whole_folder import FolderLock, remove_abandoned
 from aquaflow.config import Config
-from aquaflow.config.batch import BatchConfig
-from aquaflow.lab.batch.job import WRITTEN, BatchJob
+from aquaflow.lab.batch.job import WRITTEN, BatchConfig, BatchJob
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
 from aquaflow.lab.batch.recordings import Recording, find_recordings

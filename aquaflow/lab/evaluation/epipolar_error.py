@@ -31,7 +31,7 @@ from aquaflow.prior.flow import normalised_grey
 from aquaflow.prior.homography import detect
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.tracking.loops.verification import match_keypoints
+from aquaflow.tracking.loops import match_keypoints
 from aquaflow.types import Frame
 
 Array = npt.NDArray[np.float64]

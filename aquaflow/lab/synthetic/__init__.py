@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from aquaflow.lab.synthetic.config import SyntheticConfig
-    from aquaflow.lab.synthetic.dive import write_dive
-    from aquaflow.lab.synthetic.simulation import SimulatedDive, simulate
+    from aquaflow.lab.synthetic.dive import SimulatedDive, simulate, write_dive
     from aquaflow.lab.synthetic.telemetry import read_telemetry
     from aquaflow.lab.synthetic.truth import Truth, read_truth
     from aquaflow.lab.synthetic.water import WATER_TYPES, Medium

@@ -16,8 +16,6 @@ from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.objects import Rgb, Solid
 from aquaflow.lab.synthetic.streams import stream
 
-__all__ = ["Bodies"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 HALF_LENGTH_M = (0.05, 0.14)

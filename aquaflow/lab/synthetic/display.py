@@ -8,8 +8,6 @@ import numpy.typing as npt
 
 from aquaflow.lab.synthetic.config import Display
 
-__all__ = ["burn_in"]
-
 Picture = npt.NDArray[np.uint8]
 
 WHITE = np.array([255, 255, 255], np.float32)

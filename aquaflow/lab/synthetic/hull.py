@@ -7,8 +7,6 @@ import numpy as np
 from aquaflow.lab.synthetic.noise import FloatMap, fractal, smoothstep
 from aquaflow.lab.synthetic.relief import Area
 
-__all__ = ["painted_plates", "plated_side"]
-
 PLATE_M = (0.75, 1.5)
 """Height and length of a plate; the seams run through."""
 BEAD_M = 0.012

@@ -19,8 +19,6 @@ from torch.nn import functional
 from aquaflow.lab.synthetic.noise import FloatMap
 from aquaflow.lab.synthetic.relief import Area
 
-__all__ = ["RayHeightField"]
-
 COARSE = 2
 """The highest points are kept on cells this many times larger."""
 BALLS_M = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64)

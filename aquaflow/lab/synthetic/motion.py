@@ -11,8 +11,6 @@ import numpy.typing as npt
 from aquaflow.lab.synthetic.mounting import Mountings
 from aquaflow.lab.synthetic.path import Path
 
-__all__ = ["GRAVITY_M_S2", "TrueBodyMotion"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 GRAVITY_M_S2 = 9.80665

@@ -19,8 +19,6 @@ from aquaflow.config.stage import MountingConfig
 from aquaflow.lab.synthetic.config import FACED, SyntheticConfig
 from aquaflow.lab.synthetic.streams import stream
 
-__all__ = ["Mountings", "mountings_of", "survey_to_world"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 

@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["FloatMap", "blur", "fractal", "resize", "smoothstep"]
-
 FloatMap: TypeAlias = npt.NDArray[np.float32]
 
 

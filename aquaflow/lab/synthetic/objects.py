@@ -20,8 +20,6 @@ from aquaflow.lab.synthetic.radiance import AMBIENT, SUN, SUN_DIRECTION
 from aquaflow.lab.synthetic.relief import Area, Relief
 from aquaflow.lab.synthetic.texture import MipAtlas
 
-__all__ = ["TEXEL_M", "Rgb", "Solid", "casters", "hit", "object_texture", "radiance"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 Rgb: TypeAlias = tuple[float, float, float]
 

@@ -19,8 +19,6 @@ from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.mounting import mountings_of, survey_to_world
 from aquaflow.lab.synthetic.ways import DENSE, Way, way_of
 
-__all__ = ["Path", "plan_path"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 MAX_TURN_RATE_DEG_S = 6.0

@@ -8,12 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from aquaflow.lab.synthetic.config import Bleached, PlantedObject
 from aquaflow.lab.synthetic.noise import FloatMap
 from aquaflow.lab.synthetic.objects import Solid
-from aquaflow.lab.synthetic.planted_config import Bleached, PlantedObject
 from aquaflow.lab.synthetic.relief import Area, Relief
-
-__all__ = ["bleach", "placed_shapes"]
 
 SUNK = 0.2
 """Share of an object's half height that is in the floor, which is uneven."""

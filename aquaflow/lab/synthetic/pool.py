@@ -9,8 +9,6 @@ import numpy.typing as npt
 
 from aquaflow.lab.synthetic.objects import Rgb, Solid
 
-__all__ = ["DEPTH_M", "corners", "tiled_basin"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 MARGIN_M = 1.4

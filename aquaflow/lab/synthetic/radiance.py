@@ -14,8 +14,6 @@ from aquaflow.lab.synthetic.config import SceneKind
 from aquaflow.lab.synthetic.noise import FloatMap, blur, fractal, resize, smoothstep
 from aquaflow.lab.synthetic.relief import Relief
 
-__all__ = ["AMBIENT", "SUN", "SUN_DIRECTION", "TEXELS_PER_CELL", "bake"]
-
 TEXELS_PER_CELL = 2
 """Texels of the colours along an edge of the relief's cell."""
 SUN_DIRECTION = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])

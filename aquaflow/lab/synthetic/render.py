@@ -22,8 +22,6 @@ from aquaflow.lab.synthetic.relief import Area
 from aquaflow.lab.synthetic.texture import MipAtlas
 from aquaflow.lab.synthetic.water import Medium
 
-__all__ = ["RenderedView", "SyntheticScene", "render"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 BUNDLE = 4

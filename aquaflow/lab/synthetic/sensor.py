@@ -12,8 +12,6 @@ from aquaflow.geometry.optics import pixels_of_points
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.water import Medium
 
-__all__ = ["Snow", "expose", "quantise", "vignette"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 Image: TypeAlias = npt.NDArray[np.float32]
 

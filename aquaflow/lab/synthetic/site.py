@@ -25,8 +25,6 @@ from aquaflow.lab.synthetic.streams import stream
 from aquaflow.lab.synthetic.terrain import build_relief
 from aquaflow.lab.synthetic.ways import way_of
 
-__all__ = ["SurveySite", "camera_of", "site_of"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 TEXEL_PX = 0.6

@@ -13,17 +13,6 @@ from scipy.spatial import cKDTree
 from aquaflow.lab.synthetic.noise import FloatMap
 from aquaflow.lab.synthetic.relief import Relief
 
-__all__ = [
-    "Maker",
-    "boulder",
-    "brain_coral",
-    "branching_coral",
-    "pebble",
-    "scatter",
-    "sponge",
-    "table_coral",
-]
-
 CLEARWAY_M = 1.0
 """Nothing taller than LOW_M stands nearer than this to the vehicle's way."""
 LOW_M = 0.22

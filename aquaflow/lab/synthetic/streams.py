@@ -9,8 +9,6 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-__all__ = ["Instrument", "Part", "instrument_stream", "stream"]
-
 Part: TypeAlias = Literal[
     "terrain", "objects", "colours", "sway", "telemetry", "snow", "sensor", "mounting", "bodies"
 ]

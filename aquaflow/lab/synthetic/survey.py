@@ -25,8 +25,6 @@ from aquaflow.lab.synthetic.sensor import quantise
 from aquaflow.lab.synthetic.water import WATER_TYPES
 from aquaflow.types import Frame
 
-__all__ = ["SurveyPictures", "survey_camera"]
-
 Map: TypeAlias = npt.NDArray[np.float32]
 Lattice: TypeAlias = npt.NDArray[np.uint32]
 Box: TypeAlias = tuple[float, float, float, float]

@@ -10,8 +10,6 @@ from datetime import datetime, timezone
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
-__all__ = ["TelemetryNoise"]
-
 
 class TelemetryNoise(BaseModel):
     """Rates and errors of the simulated instruments."""

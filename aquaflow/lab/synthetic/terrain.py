@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from aquaflow.lab.synthetic import hull, net, stamps
+from aquaflow.lab.synthetic import hull, placement, stamps
 from aquaflow.lab.synthetic.config import SceneKind
 from aquaflow.lab.synthetic.noise import FloatMap, fractal, smoothstep
 from aquaflow.lab.synthetic.relief import Area, Array, Relief
-
-__all__ = ["build_relief"]
 
 
 def build_relief(
@@ -91,7 +89,7 @@ def _bedding(rng: np.random.Generator, area: Area) -> FloatMap:
 
 def _open_water(rng: np.random.Generator, area: Area) -> FloatMap:
     """Nothing solid behind a net, as far as can be seen."""
-    return np.full(area.shape, -net.BEHIND_M, np.float32)
+    return np.full(area.shape, -placement.BEHIND_M, np.float32)
 
 
 _BASES = {

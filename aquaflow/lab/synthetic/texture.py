@@ -9,8 +9,6 @@ from torch.nn import functional
 
 from aquaflow.lab.synthetic.noise import FloatMap
 
-__all__ = ["MipAtlas"]
-
 
 class MipAtlas:
     """A texture and its halvings, sampled trilinearly (bilinear in two levels, then between)."""

@@ -6,8 +6,6 @@ import torch
 
 from aquaflow.lab.synthetic.texture import MipAtlas
 
-__all__ = ["lay"]
-
 JOINT_SHARE = 0.05
 """Width of a joint over the edge of a tile."""
 JOINT_ALBEDO = 0.24

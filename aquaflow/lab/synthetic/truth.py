@@ -29,8 +29,6 @@ from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.water import Medium, load_medium
 
-__all__ = ["Truth", "read_truth"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 

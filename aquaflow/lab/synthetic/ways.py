@@ -12,8 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from aquaflow.lab.synthetic.config import SyntheticConfig
 
-__all__ = ["DENSE", "Way", "way_of"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 DENSE = 2048

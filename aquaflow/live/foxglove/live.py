@@ -11,7 +11,7 @@ from aquaflow.config.service import FoxgloveConfig
 from aquaflow.dive.metric_outputs import attitude_of
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
-from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
+from aquaflow.dive.ros.topics import MAP, OPTICAL, FrameTree
 from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, take_map_moment, water_status

@@ -24,7 +24,6 @@ from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.point_cloud import read_point_cloud
 from aquaflow.dive.restored import SeenFrame, exposure_without_water, seen_frames, without_water
 from aquaflow.dive.ros import messages, topics
-from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
 from aquaflow.dive.ros.topics import (
     ALTITUDE,
     CAMERA,
@@ -33,7 +32,9 @@ from aquaflow.dive.ros.topics import (
     DIAGNOSTICS,
     HEADING,
     LASTING,
+    MAP,
     MESSAGE_ENCODING,
+    OPTICAL,
     PATH,
     POINTS,
     POSE,
@@ -43,6 +44,7 @@ from aquaflow.dive.ros.topics import (
     SCHEMA_ENCODING,
     SPEED,
     TYPES,
+    FrameTree,
     definition,
     encode,
     require_rosbags,

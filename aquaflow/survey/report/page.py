@@ -7,7 +7,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import printable_text
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.survey.report import measures, sections, survey_sections
+from aquaflow.survey.report import measures, sections
 from aquaflow.survey.report.data import ReportData
 
 
@@ -28,15 +28,15 @@ def render_report(data: ReportData) -> str:
         sections.warnings(data),
         sections.tiles(data.metrics),
         sections.path(data),
-        survey_sections.coverage(data),
-        survey_sections.profile(data.profile),
+        sections.coverage(data),
+        sections.profile(data.profile),
         measures.reef(data.reef),
         measures.measures(data.measures),
         sections.examples(data),
         sections.medium(data),
-        survey_sections.water(data.medium),
+        sections.water(data.medium),
         sections.timeline(data),
-        survey_sections.left_out(data.left_out),
+        sections.left_out(data.left_out),
         sections.notes(data),
         sections.camera(data.camera),
         sections.stages(data),

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.survey.report import survey_sections
+from aquaflow.survey.report import sections
 from aquaflow.survey.report.data import HeldOutExample, ReportData
 from aquaflow.survey.report.figures import (
     GRID,
@@ -81,9 +81,9 @@ def _survey(pages: Pages, data: ReportData) -> None:
     view = data.coverage
     if view is not None:
         pages.heading("What was seen", PLAN_IN + 0.5)
-        pages.paragraph(survey_sections.coverage_words(view))
+        pages.paragraph(sections.coverage_words(view))
         pages.drawing(PLAN_IN, coverage_axes, view)
-        pages.table(survey_sections.coverage_rows(view))
+        pages.table(sections.coverage_rows(view))
     if data.overview is not None:
         pages.heading("The map from above, without water", OVERVIEW_IN)
         pages.picture(_decode(data.overview), OVERVIEW_IN)
@@ -104,9 +104,9 @@ def _water(pages: Pages, data: ReportData) -> None:
         return
     pages.heading("The water", WATER_IN)
     pages.drawing(WATER_IN, medium_axes, data.medium)
-    rows = [("", *survey_sections.RGB), *survey_sections.water_rows(data.medium)]
+    rows = [("", *sections.RGB), *sections.water_rows(data.medium)]
     pages.table(rows)
-    pages.paragraph(survey_sections.visibility_words(data.medium))
+    pages.paragraph(sections.visibility_words(data.medium))
 
 
 def _examples(pages: Pages, data: ReportData) -> None:

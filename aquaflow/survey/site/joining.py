@@ -18,8 +18,7 @@ from aquaflow.survey.site.joint_graph import LEAST_TRUST, JointGraph
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.loop_admission import Chains, gap_chi2
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information
-from aquaflow.tracking.loops.relocaliser import Retrieval
-from aquaflow.tracking.loops.verification import verify_keypoints
+from aquaflow.tracking.loops import Retrieval, verify_keypoints
 
 Verdict = Literal["used", "alone", "contradicts the others", "contradicts the graph"]
 
@@ -161,7 +160,7 @@ class CrossLink:
     inliers: int
     matched: int
     cells: int
-    """As in :class:`aquaflow.tracking.loops.verification.Verified`."""
+    """As in :class:`aquaflow.tracking.loops.Verified`."""
     similarity: float
     """By the words of the two pictures."""
 

@@ -7,8 +7,11 @@ seconds, is done anew each time, and gives the same bytes for the same dives.
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
-from aquaflow.base.storage.atomic import make_subfolder, write_json
+from aquaflow.base.storage.atomic import make_subfolder, open_to_append, write_json
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
@@ -27,7 +30,6 @@ from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_
 from aquaflow.survey.site.manifest import NAME, SiteDive, add_dives, read_site, state_of
 from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_merged
 from aquaflow.survey.site.placing import place
-from aquaflow.survey.site.site_log import say
 from aquaflow.survey.site.site_paths import write_paths
 from aquaflow.telemetry.world_frame import WorldFrame
 
@@ -214,3 +216,23 @@ def add_to_site(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
     for dive in new:
         say(site, "added", dive=dive.name, fingerprint=dive.fingerprint)
     return new
+
+
+# --------------------------------------------------------------------------------------------------
+# ``log.jsonl`` of a site: what was done to it, a line each.
+
+log = logging.getLogger(__name__)
+
+SITE_LOG = "log.jsonl"
+"""In a site's folder."""
+
+
+def say(site: Path, event: str, **facts: str | int) -> None:
+    """Append a line; a log that cannot be written costs nothing else."""
+    now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    line = json.dumps({"utc": now, "event": event, **facts}) + "\n"
+    try:
+        with open_to_append(site / SITE_LOG) as stream:
+            stream.write(line.encode())
+    except OSError as error:
+        log.warning("%s takes no more: %s", site / SITE_LOG, error.strerror)

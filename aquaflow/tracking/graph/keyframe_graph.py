@@ -27,7 +27,7 @@ from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import KeyframeEdge, Revisit
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.graph.table import GraphResult, Improvement, Snapshot
-from aquaflow.tracking.loops.relocaliser import Places, Relocalised
+from aquaflow.tracking.loops import Places, Relocalised
 
 LOOP_SEARCH = "loop search"
 """Name of that work."""

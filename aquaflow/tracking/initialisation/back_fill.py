@@ -14,9 +14,8 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Tracked, Wait, WaitingFrames
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 
 STAGE = "back-fill"

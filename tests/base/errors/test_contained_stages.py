@@ -21,7 +21,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import Finished
 from aquaflow.mapping import scene_water as water_fitting
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
+from aquaflow.mapping.optimisation import MapOptimiser
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, open_recording
@@ -30,7 +30,7 @@ from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.gate import FrameGate
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.initialisation.initialiser import Initialiser
-from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.loops import Places
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Dropped, Frame
 

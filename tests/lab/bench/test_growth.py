@@ -16,8 +16,8 @@ from aquaflow.cli import app
 from aquaflow.geometry.arrays import add_prefix
 from aquaflow.lab.bench.growth import benchmark as bm
 from aquaflow.lab.bench.growth import worker
+from aquaflow.lab.bench.growth.benchmark import COLUMNS, markdown
 from aquaflow.lab.bench.growth.job import GrowthJob
-from aquaflow.lab.bench.growth.table import COLUMNS, markdown
 from aquaflow.lab.bench.growth.worker import checkpoint_bytes, folder_bytes
 from aquaflow.live.checkpoint import tracking
 from aquaflow.mapping.maps import Maps

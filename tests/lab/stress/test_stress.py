@@ -17,7 +17,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.stress import suite, swim
 from aquaflow.lab.stress.case import REGISTRY, Check
 from aquaflow.mapping import gaussians
-from aquaflow.mapping.optimisation import map_optimiser
+from aquaflow.mapping import optimisation as map_optimiser
 from aquaflow.optimise.least_squares import NormalEquations
 from aquaflow.prior import flow, homography
 from aquaflow.render import adam, reference, views, water

@@ -11,7 +11,7 @@ from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.mounting import mountings_of
 from aquaflow.lab.synthetic.path import plan_path
-from aquaflow.lab.synthetic.telemetry.constants import Constants, draw_constants
+from aquaflow.lab.synthetic.telemetry.series import Constants, draw_constants
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 from tests.lab.synthetic.without_errors import WITHOUT_ERRORS
 

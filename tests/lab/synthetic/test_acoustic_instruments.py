@@ -9,10 +9,8 @@ import pytest
 from aquaflow.geometry.earth import north_east
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.relief import Area
-from aquaflow.lab.synthetic.telemetry.altitude import altitude
-from aquaflow.lab.synthetic.telemetry.position import position, utc_time
+from aquaflow.lab.synthetic.telemetry.measurement import altitude, position, utc_time, velocity
 from aquaflow.lab.synthetic.telemetry.sonar import Sonar
-from aquaflow.lab.synthetic.telemetry.velocity import velocity
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 from tests.lab.synthetic.an_hour import HOUR, constants_of, motion_of_an_hour, only, times
 

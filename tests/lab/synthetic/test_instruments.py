@@ -10,10 +10,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
-from aquaflow.lab.synthetic.telemetry.constants import Constants
-from aquaflow.lab.synthetic.telemetry.inertial import acceleration, angular_rate, attitude
-from aquaflow.lab.synthetic.telemetry.pressure import depth, tide, wave
-from aquaflow.lab.synthetic.telemetry.velocity import velocity
+from aquaflow.lab.synthetic.telemetry.measurement import (
+    acceleration,
+    angular_rate,
+    attitude,
+    depth,
+    tide,
+    velocity,
+    wave,
+)
+from aquaflow.lab.synthetic.telemetry.series import Constants
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 from tests.lab.synthetic.an_hour import constants_of, motion_of_an_hour, only, times
 

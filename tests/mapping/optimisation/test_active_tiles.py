@@ -8,7 +8,7 @@ import torch
 
 from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.optimisation.map_optimiser import record_explained, tiles_to_draw
+from aquaflow.mapping.optimisation import record_explained, tiles_to_draw
 from aquaflow.render.views import View
 from tests.mapping.mapping_scenes import (
     copied,

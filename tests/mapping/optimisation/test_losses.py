@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from aquaflow.mapping.optimisation.map_optimiser import radial_weight, scale_loss
+from aquaflow.mapping.optimisation import radial_weight, scale_loss
 
 
 def test_the_radial_weight_falls_from_one_to_082_in_the_corners() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.config.prior import PriorConfig
+from aquaflow.config.tracking import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.factory import make_prior

@@ -25,8 +25,8 @@ from aquaflow.survey.report import (
     PathPlot,
     ReportData,
     render_report,
-    survey_sections,
 )
+from aquaflow.survey.report import sections as survey_sections
 from aquaflow.survey.report.pdf import write_pdf
 from aquaflow.survey.report.report_of import MOST_REASONS, left_out, profile
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -11,8 +11,8 @@ from aquaflow.config.telemetry import LasersConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.known_lengths.board_size import BoardView
+from aquaflow.telemetry.known_lengths.finder import find_dots, laser_lengths
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.known_lengths.laser_spacing import find_dots, laser_lengths
 
 CAMERA = CameraModel(640, 480, 520.0, 520.0, 318.0, 243.0)
 METRES_PER_UNIT = 2.05

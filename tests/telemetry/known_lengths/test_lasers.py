@@ -7,8 +7,8 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.known_lengths.board_size import BoardView
+from aquaflow.telemetry.known_lengths.finder import find_dots
 from aquaflow.telemetry.known_lengths.known_length import scale_of
-from aquaflow.telemetry.known_lengths.laser_spacing import find_dots
 from tests.telemetry.known_lengths.laser_scenes import (
     CAMERA,
     HEIGHTS,

@@ -21,7 +21,7 @@ from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.graph.pose_graph import Edge
 from aquaflow.tracking.graph.table import Improvement, Snapshot
-from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.loops import Places
 from tests.tracking.tracking_scenes import CAMERA, Array, SeaFloor, lawn_path
 
 COUNT = 7

@@ -22,7 +22,7 @@ from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph import keyframe_graph
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
-from aquaflow.tracking.loops.relocaliser import Places, Relocalised
+from aquaflow.tracking.loops import Places, Relocalised
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, SIGMA, circle
 

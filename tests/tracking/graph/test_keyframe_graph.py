@@ -15,7 +15,7 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Revisit, Step, Tracked
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
-from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.loops import Places
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Frame
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, pose

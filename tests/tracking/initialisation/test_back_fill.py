@@ -12,9 +12,8 @@ from aquaflow.base.worker import Worker
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking.frames import Step, Tracked
+from aquaflow.tracking.frames import BOUNDS, Bound, Step, Tracked, Wait
 from aquaflow.tracking.tracker import Tracker
-from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from aquaflow.types import Frame
 from tests.tracking.tracked_clips import Prompt, error_share, run
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path

@@ -8,7 +8,7 @@ import pytest
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.tracking.loops.verification import Neighbours
+from aquaflow.tracking.loops import Neighbours
 from tests.tracking.tracked_clips import SMALL, plane_depth
 from tests.tracking.tracking_scenes import KnownView, pose
 

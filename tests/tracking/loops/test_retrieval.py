@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config import RetrievalConfig
 from aquaflow.prior.contract import Keypoints
-from aquaflow.tracking.loops.relocaliser import Retrieval, _similarity
+from aquaflow.tracking.loops import Retrieval, _similarity
 
 DIMENSION = 48
 SIZE = 400

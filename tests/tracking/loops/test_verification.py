@@ -12,7 +12,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow_pair import FlowEncoding
-from aquaflow.tracking.loops.verification import match_keypoints, verify
+from aquaflow.tracking.loops import match_keypoints, verify
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, pose
 
 FLOOR = SeaFloor()

@@ -42,7 +42,7 @@ def fit_backscatter(
     chosen = _darkest(colours, z)
     if len(chosen) < FEWEST:
         raise NotRestoredError("too few dark pixels show the backscatter")
-    return np.stack([_fit(channel, z[chosen]) for channel in colours[chosen].T])
+    return np.stack([_fit_backscatter(channel, z[chosen]) for channel in colours[chosen].T])
 
 
 def _darkest(
@@ -60,7 +60,7 @@ def _darkest(
     return np.concatenate(chosen)
 
 
-def _fit(
+def _fit_backscatter(
     values: Array,  # [M] one channel of dark pixels
     z: Array,  # [M]
 ) -> Array:

@@ -11,8 +11,6 @@ import numpy.typing as npt
 
 from aquaflow.lab.synthetic.relief import Area
 
-__all__ = ["Sonar"]
-
 Array: TypeAlias = npt.NDArray[np.float64]
 
 RINGS = 4

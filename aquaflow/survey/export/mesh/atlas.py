@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.render.transfers import checkpoint_in
 from aquaflow.survey.export.mesh.blocks import truncation
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh

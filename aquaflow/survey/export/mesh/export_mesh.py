@@ -11,8 +11,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import InputError, load
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement

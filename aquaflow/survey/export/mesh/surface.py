@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import load
 from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Chunk, truncation
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, SIGMA, ViewSurfaces

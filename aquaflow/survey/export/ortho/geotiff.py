@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError, first_line
-from aquaflow.base.errors.extra import load
+from aquaflow.base.errors import InputError, first_line, load
 from aquaflow.base.storage.atomic import fresh_file, scratch_file
 from aquaflow.survey.export.ortho.grid import NODATA, TILE_PX, Grid, GridTile, RasterFile
 from aquaflow.survey.export.ortho.ground import Ground

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from aquaflow.lab.evaluation.water_peers import sea_thru
-from aquaflow.lab.evaluation.water_peers.attenuation import fit_attenuation, two_exponentials
 from aquaflow.lab.evaluation.water_peers.backscatter import backscatter, fit_backscatter
 from aquaflow.lab.evaluation.water_peers.contract import NotRestoredError
-from aquaflow.lab.evaluation.water_peers.sea_thru import GEOMETRY, local_average
+from aquaflow.lab.evaluation.water_peers.sea_thru import (
+    GEOMETRY,
+    fit_attenuation,
+    local_average,
+    two_exponentials,
+)
 from tests.lab.evaluation.water_peers.scene import HazyScene, hazy_scene, matched_psnr
 
 BETA, VEIL = (1.2, 0.6, 0.4), (0.1, 0.3, 0.4)

@@ -1,1 +1,0 @@
-"""The map's joint optimisation: objective, losses, schedule (Sec. 3.4)."""

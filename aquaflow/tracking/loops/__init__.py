@@ -1,1 +1,0 @@
-"""Places seen before: retrieval, geometric verification, relocalisation."""
