@@ -30,7 +30,7 @@ APART = (({"tracking"}, {"mapping", "water"}),)
 USERS_OF_DRIVERS = {"cli", "sim_drivers", "recordings"}
 """Logs on disk hold the bytes that devices sent, and are decoded as those are."""
 
-LOOSE_MODULES = {"types"}
+LOOSE_MODULES = {"slam", "types"}
 """Modules right under ``aquaflow``; everything else lies in a folder."""
 
 HEIGHT = {family: -level for level, floor in enumerate(FLOORS) for family in floor}

@@ -38,8 +38,7 @@ from aquaflow.mapping.work import MIN_VIEWS, Progress
 from aquaflow.recordings.kept_pictures import KeptPictures, PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
-from aquaflow.slam import Slam
-from aquaflow.slam.slam import FinishTime
+from aquaflow.slam import FinishTime, Slam
 from aquaflow.sources.picture_check import oddities
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error

@@ -38,8 +38,7 @@ from aquaflow.mapping.work import OwnedMaps
 from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
-from aquaflow.slam import Slam
-from aquaflow.slam.slam import make_maps
+from aquaflow.slam import Slam, make_maps
 from aquaflow.sources.newest import OLDEST_NS
 from aquaflow.types import Dropped
 

@@ -23,7 +23,7 @@ from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import FINISHING
 from aquaflow.mapping.work import Progress
-from aquaflow.slam.slam import FinishTime
+from aquaflow.slam import FinishTime
 
 log = logging.getLogger(__name__)
 

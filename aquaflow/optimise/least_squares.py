@@ -18,7 +18,7 @@ the information of x, and its inverse the covariance.
 
 What keeps a loop of its own says why at its top: ``tracking/graph/optimisation.py`` (unknowns that
 grow on the way), ``mapping/optimisation.py`` (derivatives that are drawn),
-``survey/change/registration.py`` (pairs that change), ``tracking/learned/scaling.py`` (noise of two
+``survey/change/registration.py`` (pairs that change), ``tracking/learned.py`` (noise of two
 parts).
 """
 

@@ -15,7 +15,7 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.frames import Wait, WaitingFrames
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrate, fused_pointmap
-from aquaflow.tracking.learned.scaling import LearnedDepth, add_learned, agreement, unscaled_depth
+from aquaflow.tracking.learned import LearnedDepth, add_learned, agreement, unscaled_depth
 from aquaflow.tracking.pose.matcher import pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, solve_pose
 from aquaflow.types import Frame

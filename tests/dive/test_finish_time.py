@@ -16,8 +16,7 @@ from aquaflow.dive.held_out import spread
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.lab.evaluation.trajectory_error import read_tum
-from aquaflow.slam import Slam
-from aquaflow.slam.slam import EVALUATED, REFINED, SETTLED, FinishTime
+from aquaflow.slam import EVALUATED, REFINED, SETTLED, FinishTime, Slam
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame
 

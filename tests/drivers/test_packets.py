@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from aquaflow.drivers.link import LinkCounters
-from aquaflow.drivers.protocol.nmea_sentence import framing
+from aquaflow.drivers.protocol.nmea import framing
 from aquaflow.drivers.protocol.packets import PacketReader
 from aquaflow.drivers.telemetry import decoder_of
 from aquaflow.drivers.transport.can import pack

@@ -20,7 +20,7 @@ from aquaflow.prior.flow_pair import FlowPair
 from aquaflow.prior.folder import CARD
 from aquaflow.prior.hybrid import HybridPair
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
-from aquaflow.tracking.learned.scaling import learned_depth
+from aquaflow.tracking.learned import learned_depth
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 from tests.prior.tiny_depth import LOWEST, card, painted, write_network
 from tests.tracking.learned.learned_scenes import KNOWN_SIGMA, TRUTH, measured

@@ -11,7 +11,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.config import PriorConfig
 from aquaflow.prior.factory import make_prior
 from aquaflow.prior.oracle import TRUTH, TrueView, write_oracle
-from aquaflow.tracking.learned.scaling import unscaled_depth
+from aquaflow.tracking.learned import unscaled_depth
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path
 
 POSES = [lawn_path(8)[0], lawn_path(8)[6]]

@@ -14,14 +14,13 @@ from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.link import SerialConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.telemetry import NmeaConfig
-from aquaflow.recordings.candump import Candump
 from aquaflow.recordings.csv_telemetry import CsvTelemetry
 from aquaflow.recordings.dataflash import Dataflash
 from aquaflow.recordings.images import ImageFolder
 from aquaflow.recordings.manifest import ManifestTelemetry
 from aquaflow.recordings.nmea_text import NmeaText
 from aquaflow.recordings.telemetry_log import LogTime
-from aquaflow.recordings.tlog import Tlog
+from aquaflow.recordings.tlog import Candump, Tlog
 from aquaflow.sources import (
     mounting_of,
     open_recorded_telemetry,

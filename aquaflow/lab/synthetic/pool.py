@@ -11,7 +11,7 @@ from aquaflow.lab.synthetic.objects import Rgb, Solid
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
-MARGIN_M = 1.4
+POOL_MARGIN_M = 1.4
 """Between the vehicle's way and the walls."""
 DEPTH_M = 3.2
 """Of the basin: the height of its walls."""
@@ -31,7 +31,7 @@ def corners(
     way: Array,  # [N, 2] m
 ) -> tuple[Array, Array]:
     """[2] m each: the pool's lower and upper corner in the survey frame."""
-    return way.min(axis=0) - MARGIN_M, way.max(axis=0) + MARGIN_M
+    return way.min(axis=0) - POOL_MARGIN_M, way.max(axis=0) + POOL_MARGIN_M
 
 
 def tiled_basin(

@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.prior.contract import Encoding, PairGeometry
 from aquaflow.tracking.frames import Quality
-from aquaflow.tracking.learned.scaling import learned_depth
+from aquaflow.tracking.learned import learned_depth
 from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
 
 LEAST_TRIANGULATED = 0.3

@@ -8,7 +8,7 @@ import pytest
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import RangeUnit
-from aquaflow.tracking.learned.scaling import (
+from aquaflow.tracking.learned import (
     FARTHEST,
     LearnedDepth,
     learned_depth,

@@ -9,7 +9,7 @@ from aquaflow.config import TrackingConfig
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import UNKNOWN_VARIANCE, Keyframe, KeyframeStore, Pointmap
-from aquaflow.tracking.learned.scaling import add_learned
+from aquaflow.tracking.learned import add_learned
 from aquaflow.tracking.pose.depth_fusion import fuse
 from aquaflow.tracking.pose.matcher import KeyframeMatcher
 from tests.tracking.learned.learned_scenes import KNOWN_SIGMA, TRUTH, measured, network

@@ -10,8 +10,8 @@ import pytest
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.learned.moving import SeenBefore, moving
-from aquaflow.tracking.learned.scaling import add_learned
+from aquaflow.tracking.current_keyframe import SeenBefore, moving
+from aquaflow.tracking.learned import add_learned
 from tests.tracking.learned.learned_scenes import KNOWN_SIGMA, TRUTH, measured, network
 from tests.tracking.tracking_scenes import CAMERA
 

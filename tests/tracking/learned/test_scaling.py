@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.learned.scaling import (
+from aquaflow.tracking.learned import (
     HONESTY,
     LEAST_COMMON,
     agreement,
