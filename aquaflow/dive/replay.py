@@ -19,7 +19,7 @@ from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.recordings.playback import Event, Playback
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, mounting_of
-from aquaflow.sources.newest import read_past_failures
+from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.time_offset import (

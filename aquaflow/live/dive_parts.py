@@ -39,7 +39,7 @@ from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam, make_maps
-from aquaflow.sources.newest import OLDEST_NS
+from aquaflow.sources.wall_clock import OLDEST_NS
 from aquaflow.types import Dropped
 
 # --------------------------------------------------------------------------------------------------

@@ -16,9 +16,9 @@ from aquaflow.mapping.scene import RenderedMap, Scene, orientations
 from aquaflow.render.transfers import map_out, picture_out, water_in
 from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID
-from aquaflow.water.exposure import Recovered
 from aquaflow.water.medium import MIN_TRANSMISSION, WaterParameters
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.white_balance import Recovered
 
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""

@@ -19,11 +19,13 @@ from aquaflow.render.contract import Renderer, activate
 from aquaflow.render.transfers import picture_out, pose_in, water_in, water_out, weights_in
 from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
-from aquaflow.water.exposure import Recovered, WhiteBalance, gain_of, learn_gain
+from aquaflow.water.exposure import gain_of, learn_gain
 from aquaflow.water.medium import LearnedMedium, WaterParameters
-from aquaflow.water.nearest import Nearest, open_water
+from aquaflow.water.nearest import Nearest
+from aquaflow.water.open_water import open_water
 from aquaflow.water.parameters import TERMS, gain_map
 from aquaflow.water.sunlight import Sunlight
+from aquaflow.water.white_balance import Recovered, WhiteBalance
 
 MOST_DISTANCES = 1 << 22
 """Between Gaussians and cameras at a time: 16 MB. Half a million Gaussians and 5,000 views at once

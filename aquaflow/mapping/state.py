@@ -39,7 +39,8 @@ from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.dense_adam import STEP, DenseAdam
 from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
-from aquaflow.water.exposure import WhiteBalance, log_gains_of, set_log_gain
+from aquaflow.water.exposure import log_gains_of, set_log_gain
+from aquaflow.water.white_balance import WhiteBalance
 
 Facts = dict[str, Any]
 

@@ -25,13 +25,14 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import MediumConfig, WaterPriorsConfig
-from aquaflow.water.exposure import WhiteBalance
 from aquaflow.water.model import BELIEVED, WaterModel
-from aquaflow.water.nearest import Nearest, nearest_of, white_balance, with_open_water
+from aquaflow.water.nearest import Nearest, nearest_of, white_balance
 from aquaflow.water.observations import Observations, variance_over_range
+from aquaflow.water.open_sightings import with_open_water
 from aquaflow.water.parameters import RATE_ROWS, Model, rate_rows
 from aquaflow.water.sightings import PosedPicture
 from aquaflow.water.solver import WaterFit, descend
+from aquaflow.water.white_balance import WhiteBalance
 
 Array = npt.NDArray[np.float64]
 

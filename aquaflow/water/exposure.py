@@ -8,7 +8,6 @@ The mean over the views is held near one, else bright views and dark points coul
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,6 @@ from torch import Tensor
 
 from aquaflow.render.transfers import water_in, water_out
 from aquaflow.render.views import View
-from aquaflow.water.medium import MAX_RESTORED, WaterParameters
 
 Array = npt.NDArray[np.float64]
 
@@ -108,100 +106,3 @@ def _between(
 ) -> Array:
     at = [view.frame_index for view in views]
     return np.array([np.interp(frame_index, at, values[:, c]) for c in range(3)])
-
-
-# --------------------------------------------------------------------------------------------------
-# White balance and amplification of a scene without its water.
-#
-# The clean radiance J is the scene as it would look through no water at all. Nobody has seen it so:
-# its white balance is the camera's, set for a scene in water, times what the fit makes of the water
-# between, and an error in the attenuation becomes a cast of colour. So what is shown is J under one
-# gain per channel, by which what was seen nearest has on the mean the colour that the camera saw,
-# backscatter included: what is nearest keeps its colours, and what is further away gets the same.
-#
-# What returns little light is amplified, its noise and the water's own uncertainty with it. A
-# picture is therefore the mean of what J may be (a linear minimum mean square error estimate):
-# where light is lost in one channel that channel follows the others towards a grey scene; where it
-# is lost in all, it fades to the scene's mean.
-#
-# With T and B the transmission and the backscatter, A = diag(T), noise covariance N (diagonal) and
-# J ~ (m, S), a pixel I = A J + B + noise gives
-#
-#     J-hat = G (I - B) + (1 - G A) m,   G = S A (A S A + N)^-1
-#
-# G A is the share of J-hat that follows the pixel, 1 - G A the share that is the prior's (Rodgers,
-# Inverse Methods for Atmospheric Sounding, 2000, calls G A the averaging kernel). Its eigenvalues
-# lie in [0, 1), so the confidence of a pixel is tr(G A) / 3: 1 where all three channels were seen,
-# 1/3 where one was and the others follow it, 0 where the prior stands alone.
-#
-# How far a channel may be amplified: G_cc is the regression of J_c on its own channel's light given
-# the others' light, T_c v / (T_c^2 v + N_c), with v <= S_cc the variance of J_c that the others
-# leave. As T_c^2 v + N_c is at least T_c^2 v and at least 2 T_c sqrt(v N_c),
-#
-#     G_cc <= min(1 / T_c, sqrt(S_cc / N_c) / 2)
-#
-# whatever the pixel is: less light is amplified more only until it drowns in the noise.
-
-PICTURE_NOISE = 0.01
-"""Deviation of a pixel's value: two grey levels and a half, as in compressed video."""
-VEIL_ERROR = 0.1
-"""Relative error of the backscatter: what its closed form misses on Curasao, IUI3 and the reef."""
-CONTRAST = 0.6
-"""Deviation of a scene's colours over their mean: 0.4 to 0.8 on the shared clips."""
-GREY = 0.9
-"""Correlation of a scene's channels: 0.85 to 0.97 on the same clips' nearest quarter."""
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """A picture without its water, and how far it can be relied on."""
-
-    picture: Tensor
-    """[H, W, 3]"""
-    confidence: Tensor
-    """[H, W] in [0, 1], the share of the colour that is the picture's and not the prior's."""
-    amplification: Tensor | None = None
-    """[H, W, 3] restored per observed light of the same channel; None without a posterior."""
-    allowed: Tensor | None = None
-    """[H, W, 3] the most that the posterior lets it be at that range."""
-
-
-@dataclass(frozen=True)
-class WhiteBalance:
-    """What restored pictures are shown in."""
-
-    near_range: float
-    """Map units; the range whose colours are kept."""
-    mean: tuple[float, float, float]
-    """Mean of J over what was seen, RGB."""
-    gain: tuple[float, float, float]
-    """Of J, RGB: by it what was seen nearest keeps the mean colour that the camera saw."""
-    attenuation_sigma: float
-    """Relative deviation of the attenuation, mean of RGB."""
-
-    def recover(
-        self,
-        image: Tensor,  # [H, W, 3] evenly lit
-        z: Tensor,  # [H, W] range, map units
-        water: WaterParameters,
-        uneven: Tensor | None = None,  # [H, W] gain of the backscatter
-    ) -> Recovered:
-        """The balanced picture without water; the module's text derives it."""
-        T, veil = water.transmission(z), water.backscatter(z)
-        veil = veil if uneven is None else veil * uneven[..., None]
-        mean, white = (water_in(each, z.device) for each in (self.mean, self.gain))
-        depth = water.beta_a * (z[..., None] - self.near_range).clamp_min(0.0)
-        noise = PICTURE_NOISE**2 + (VEIL_ERROR * veil).square()
-        noise = noise + (self.attenuation_sigma * depth * mean * T).square()
-        deviation = CONTRAST * mean
-        spread = GREY * deviation[:, None] * deviation + (1.0 - GREY) * torch.diag(deviation**2)
-        seen = T[..., :, None] * spread * T[..., None, :] + torch.diag_embed(noise)
-        G = torch.linalg.solve(seen, T[..., :, None] * spread).mT
-        J = mean + (G @ (image - veil - T * mean)[..., None])[..., 0]
-        own = G.diagonal(dim1=-2, dim2=-1)
-        return Recovered(
-            (J * white).clamp(0.0, MAX_RESTORED),
-            (own * T).mean(dim=-1).clamp(0.0, 1.0),
-            own * white,
-            torch.minimum(1.0 / T, deviation / (2.0 * noise.sqrt())) * white,
-        )

@@ -17,7 +17,8 @@ from typing import NamedTuple, TypeAlias
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.link import about
-from aquaflow.drivers.protocol.packets import LineFraming, PacketDecoder, PartialMotion
+from aquaflow.drivers.protocol.packets import LineFraming, PacketDecoder
+from aquaflow.drivers.protocol.partial import PartialMotion
 from aquaflow.types import Altitude, Depth, TelemetrySample, UtcTime
 
 # --------------------------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
 """Video streams from the network, through OpenCV's FFmpeg."""
 
-from aquaflow.drivers.stream.rtp_capture import StreamCamera
+from aquaflow.drivers.stream.camera import StreamCamera
 
 __all__ = ["StreamCamera"]

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from aquaflow.config.cameras import StreamConfig
-from aquaflow.drivers.capture import Capture, RawPicture
+from aquaflow.drivers.capture import RawPicture
 from aquaflow.drivers.ffmpeg import rgb_of
 from aquaflow.drivers.h264 import (
     KEY_PICTURE,
@@ -19,10 +19,8 @@ from aquaflow.drivers.h264 import (
     Units,
     decode,
 )
-from aquaflow.drivers.live import LiveCamera
-from aquaflow.drivers.stream.capture import OPEN_TIMEOUT_S, Ages, StreamCapture
-from aquaflow.drivers.stream.session import Session, is_at_a_port, session_of
-from aquaflow.drivers.stream.udp_port import bound, check_next_port, first_packet
+from aquaflow.drivers.stream.capture import OPEN_TIMEOUT_S, Ages
+from aquaflow.drivers.stream.session import Session
 from aquaflow.types import CameraModel
 
 NEEDED = frozenset({KEY_PICTURE, SEQUENCE_PARAMETERS, PICTURE_PARAMETERS})
@@ -229,53 +227,3 @@ def _aggregate(payload: bytes) -> Units:
         units.append(payload[at + 2 : at + 2 + size])
         at += 2 + size
     return units
-
-
-# --------------------------------------------------------------------------------------------------
-# A video stream as a live CameraSource.
-
-
-class StreamCamera(LiveCamera):
-    """The newest picture of a stream; connects again whenever it breaks."""
-
-    def __init__(self, name: str, config: StreamConfig) -> None:
-        super().__init__(name, config, lambda: open_stream(name, config))
-
-    @classmethod
-    def configured(cls, name: str, config: StreamConfig) -> StreamCamera:
-        """The camera of :func:`aquaflow.sources.open_camera`."""
-        return cls(name, config)
-
-
-# --------------------------------------------------------------------------------------------------
-# Which reader a stream needs: ours for H.264 in RTP at a port, FFmpeg for all else.
-
-MPEG_TS = 0x47
-"""First byte of each packet of MPEG-TS."""
-
-
-def open_stream(name: str, config: StreamConfig) -> Capture:
-    """Connect to the stream of the camera ``name``.
-
-    Raises:
-        ConnectionError: no server answers, a port is taken, or what comes is no video.
-        FileNotFoundError: there is no such SDP file.
-    """
-    if not is_at_a_port(config.url):
-        return StreamCapture(name, config, config.url)
-    session = session_of(config)
-    receiver = bound(session.port)
-    try:
-        packet = first_packet(receiver, session.port)
-        is_bare = packet[0] != MPEG_TS
-        payload_type = session.payload_type(packet) if is_bare else 0
-        if session.is_h264(payload_type):
-            return RtpCapture(name, config, session, receiver, packet)
-    except OSError:
-        receiver.close()
-        raise
-    receiver.close()  # FFmpeg opens the port itself
-    if not is_bare:
-        return StreamCapture(name, config, config.url)
-    check_next_port(session.port)
-    return StreamCapture(name, config, session.data_url(payload_type))

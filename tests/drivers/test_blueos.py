@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from aquaflow.config.cameras import StreamConfig
-from aquaflow.drivers.network_discovery import rtsp as blueos
-from aquaflow.drivers.network_discovery.rtsp import FREE_PORT, blueos_streams
+from aquaflow.drivers.network_discovery import blueos
+from aquaflow.drivers.network_discovery.blueos import FREE_PORT, blueos_streams
 
 Serve = Callable[[object], tuple[list[str], int]]
 

@@ -13,9 +13,11 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import StreamConfig
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.drivers.network_discovery import conversation
+from aquaflow.drivers.network_discovery.blueos import blueos_streams
 from aquaflow.drivers.network_discovery.mavlink import mavlink_links
-from aquaflow.drivers.network_discovery.onvif import onvif_cameras, rtp_payload, rtp_streams
-from aquaflow.drivers.network_discovery.rtsp import blueos_streams, rtsp_streams
+from aquaflow.drivers.network_discovery.onvif import onvif_cameras
+from aquaflow.drivers.network_discovery.rtp import rtp_payload, rtp_streams
+from aquaflow.drivers.network_discovery.rtsp import rtsp_streams
 from aquaflow.drivers.network_discovery.waterlinked import NAME, waterlinked_dvls
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice

@@ -167,7 +167,7 @@ def test_what_is_neither_rtp_nor_mpeg_ts_is_one_sentence() -> None:
 def test_rtp_that_makes_no_picture_says_what_may_be_wrong(
     codec: str, problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for reader in ("ffmpeg", "rtp_capture"):
+    for reader in ("capture", "rtp_capture"):
         monkeypatch.setattr(f"aquaflow.drivers.stream.{reader}.OPEN_TIMEOUT_S", 0.5)
     port = free_port()
     with (

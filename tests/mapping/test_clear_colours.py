@@ -22,7 +22,7 @@ from aquaflow.mapping.restoration import (
 from aquaflow.mapping.state import copy_map
 from aquaflow.render.contract import radiance
 from aquaflow.telemetry.world_frame import WorldFrame
-from aquaflow.water.exposure import WhiteBalance
+from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of
 
 WATER = ((0.9, 0.15, 0.1), (0.05, 0.25, 0.3), (0.5, 0.3, 0.2))

@@ -15,7 +15,7 @@ from aquaflow.mapping.restoration import (
 )
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.views import View
-from aquaflow.water.exposure import WhiteBalance
+from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 BRIGHTER_ABOVE = torch.tensor([0.1, -0.6, -0.1, 0.0, 0.2])

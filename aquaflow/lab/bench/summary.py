@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import logging
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, TypeVar
+from typing import Any
 
-from aquaflow.base.errors import AquaFlowError
 from aquaflow.lab.evaluation.water_peers.contract import NAMES
 
 Row = dict[str, Any]
@@ -152,20 +148,3 @@ NOTES = (
 
 def _times_100(value: float | None) -> float | None:
     return None if value is None else 100.0 * value
-
-
-# --------------------------------------------------------------------------------------------------
-# How a process of a benchmark answers: a job comes in on stdin, its row goes out on stdout.
-
-AnyJob = TypeVar("AnyJob")
-
-
-def answer(from_text: Callable[[str], AnyJob], perform: Callable[[AnyJob], dict[str, Any]]) -> None:
-    """Print the row of one job as JSON; of one that failed, the sentence that says why."""
-    logging.captureWarnings(True)
-    job = from_text(sys.stdin.read())
-    try:
-        row = perform(job)
-    except AquaFlowError as error:
-        row = {"failed": str(error)}
-    print(json.dumps(row))

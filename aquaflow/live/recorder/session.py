@@ -12,7 +12,7 @@ from aquaflow.base.errors import AquaFlowError
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.recordings.playback import Event, Playback, arrival_of, delay_event
 from aquaflow.sources import CameraSource, RawTap, TelemetrySource
-from aquaflow.sources.newest import WallClock
+from aquaflow.sources.wall_clock import WallClock
 from aquaflow.types import Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)

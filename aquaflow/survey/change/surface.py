@@ -23,7 +23,7 @@ from aquaflow.survey.export.mesh.export_mesh import VOXEL_PX, fused_surface
 from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, ViewSurfaces, surfaces_of_map
 from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.measure.drawn_heights import MATCH_PX
-from aquaflow.water.exposure import CONTRAST
+from aquaflow.water.white_balance import CONTRAST
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, int, int], None]

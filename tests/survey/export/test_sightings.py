@@ -15,7 +15,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
 from aquaflow.survey.export.ortho.sightings import ViewRanges
-from aquaflow.water.exposure import WhiteBalance
+from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import gaussians_at
 from tests.metric_scenes import metric_frame
 from tests.survey.export.survey_scenes import ALTITUDE_M, CAMERA, DEPTH_M, STOPS, height, surveyed

@@ -1,0 +1,95 @@
+"""Open water in the pictures as observations: what backscatter looks like at infinity."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.water.observations import PICTURES_AT_ONCE, Observations
+from aquaflow.water.open_water import open_water
+from aquaflow.water.parameters import Trial, gain_map
+from aquaflow.water.sightings import PosedPicture
+
+Array = npt.NDArray[np.float64]
+
+COLUMNS, ROWS = 8, 6
+"""Cells of a picture; one that is all open water gives an observation, its mean colour. Water is
+smooth: finer cells say the same again."""
+MOST_UNEVEN = 0.012
+"""Relative deviation of a cell's brightness, in blocks, from a plane. Nine of ten open cells have
+less on IUI3 and two of three on Curasao; where ground is dim and far, in murky rendered dives, one
+of three to ten."""
+BLOCKS = 4
+"""Along each side of a cell."""
+INFINITE = 1e3
+"""Range of open water over the median range of the surface: no light of a surface is left."""
+
+
+def with_open_water(
+    seen: Observations,
+    pictures: Sequence[PosedPicture],
+    trial: Trial,  # the water as found without
+) -> Generator[None, None, Observations]:
+    """The observations, and those of what looks like open water by that trial, a point each; with
+    pauses."""
+    views, cells, colours = [], [], []
+    for view in range(min(len(pictures), len(trial.exposure))):
+        xy, colour = _open_cells(pictures[view], trial, view)
+        views.append(np.full(len(xy), view))
+        cells.append(xy)
+        colours.append(colour)
+        if view % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
+            yield
+    count = sum(len(each) for each in views)
+    if count == 0:
+        return seen
+    return replace(
+        seen,
+        point=np.concatenate([seen.point, seen.points + np.arange(count)]),
+        view=np.concatenate([seen.view, *views]),
+        colour=np.concatenate([seen.colour, *colours]),
+        z=np.concatenate([seen.z, np.full(count, INFINITE * seen.median_range)]),
+        xy=np.concatenate([seen.xy, *cells]),
+    )
+
+
+def open_area(picture: PosedPicture, trial: Trial, view: int) -> npt.NDArray[np.bool_]:
+    """[ceil(H / 2), ceil(W / 2)] where a view's picture shows open water, by that trial."""
+    image = picture.half_size()
+    height, width = image.shape[:2]
+    lit = gain_map(trial.shading, height, width)[..., None] * np.exp(trial.exposure[view])
+    B_inf = gain_map(trial.unevenness, height, width)[..., None] * trial.B_inf
+    found = open_water((image / lit).astype(np.float32), B_inf.astype(np.float32))
+    return found & picture.shows_scene()
+
+
+def _open_cells(picture: PosedPicture, trial: Trial, view: int) -> tuple[Array, Array]:
+    """Centres [Q, 2] of a view's open cells, each axis from -1 to 1, and mean colours [Q, 3]."""
+    image, is_open = picture.half_size(), open_area(picture, trial, view)
+    height, width = is_open.shape
+    xy, colours = [], []
+    for rows in np.array_split(np.arange(height), ROWS):
+        for columns in np.array_split(np.arange(width), COLUMNS):
+            cell = np.ix_(rows, columns)
+            if is_open[cell].all() and _is_even(image[cell]):
+                centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+                xy.append(centre / (0.5 * width, 0.5 * height) - 1.0)
+                colours.append(image[cell].mean(axis=(0, 1)))
+    return np.array(xy).reshape(-1, 2), np.array(colours, np.float64).reshape(-1, 3)
+
+
+def _is_even(
+    cell: npt.NDArray[np.float32],  # [h, w, 3]
+) -> bool:
+    """True if its brightness changes as open water's does: evenly, or not at all."""
+    blocks = cv2.resize(cell, (BLOCKS, BLOCKS), interpolation=cv2.INTER_AREA).mean(axis=-1)
+    at = np.linspace(-1.0, 1.0, BLOCKS)
+    plane = [np.ones((BLOCKS, BLOCKS)), np.tile(at, (BLOCKS, 1)), np.tile(at, (BLOCKS, 1)).T]
+    A = np.stack(plane, axis=-1).reshape(-1, 3)
+    values = blocks.reshape(-1).astype(np.float64)
+    residuals = values - A @ np.linalg.lstsq(A, values, rcond=None)[0]
+    return bool(residuals.std() < MOST_UNEVEN * values.mean())
