@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from aquaflow.config.stage import MountingConfig
-from aquaflow.drivers.fixes import Vector, cross, from_euler, inverse, move, product, rotate
+from aquaflow.drivers.samples import Vector, cross, from_euler, inverse, move, product, rotate
 from aquaflow.types import (
     Acceleration,
     Altitude,

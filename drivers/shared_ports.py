@@ -19,7 +19,7 @@ from aquaflow.drivers.link import about
 from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.transport import OpenLink
-from aquaflow.drivers.transport.socket import SharedUdp
+from aquaflow.drivers.transport.ports import SharedUdp
 
 log = logging.getLogger(__name__)
 

@@ -211,7 +211,7 @@ def _points(
     dive: Dive, path: Path, format: ExportFormat, water: bool, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.point_cloud import read_point_cloud
-    from aquaflow.survey.export.e57 import write_e57, write_laz
+    from aquaflow.survey.export.point_clouds import write_e57, write_laz
 
     cloud = read_point_cloud(dive, water)
     write = write_laz if format is ExportFormat.laz else write_e57
@@ -268,7 +268,7 @@ def _posed_pictures(
     progress: Progress,
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.restored import export_posed_pictures
-    from aquaflow.survey.export.colmap import write_colmap, write_nerfstudio
+    from aquaflow.survey.export.posed_pictures import write_colmap, write_nerfstudio
 
     write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
     count = export_posed_pictures(dive, folder, write, recording, restored, progress)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from aquaflow.drivers.fixes import from_euler, plausible, sigma_of
+from aquaflow.drivers.samples import from_euler, plausible, sigma_of
 from aquaflow.recordings.telemetry_log import TelemetryLog
 from aquaflow.types import (
     Acceleration,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from aquaflow.drivers.fixes import Vector, normalise, plausible, product, sigma_of
+from aquaflow.drivers.samples import Vector, normalise, plausible, product, sigma_of
 from aquaflow.recordings.rosbag import decode, is_bag, messages_in, open_bag, origin_of, stamp_of
 from aquaflow.recordings.telemetry_log import LoggedUtc
 from aquaflow.types import (

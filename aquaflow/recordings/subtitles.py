@@ -25,7 +25,7 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from aquaflow.drivers.fixes import from_euler, plausible, sigma_of
+from aquaflow.drivers.samples import from_euler, plausible, sigma_of
 from aquaflow.recordings.telemetry_log import UTC_EVERY_NS, TelemetryLog
 from aquaflow.types import Altitude, Attitude, Depth, Position, TelemetrySample, UtcTime
 

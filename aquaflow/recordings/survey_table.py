@@ -10,7 +10,7 @@ import math
 from datetime import datetime, timezone
 from typing import TypeAlias
 
-from aquaflow.drivers.fixes import from_euler, plausible, sigma_of
+from aquaflow.drivers.samples import from_euler, plausible, sigma_of
 from aquaflow.types import Altitude, Attitude, Depth, Position, TelemetrySample
 
 SECONDS, UTC = "t_s", "utc"

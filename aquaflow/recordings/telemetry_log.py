@@ -10,9 +10,9 @@ from typing import ClassVar, NamedTuple
 
 from aquaflow.base.clocks.wall import JUMP_NS
 from aquaflow.config.telemetry import AnyDevice
-from aquaflow.drivers.fixes import plausible
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.mounting import BodyFrame, Mounting
+from aquaflow.drivers.samples import plausible
 from aquaflow.drivers.telemetry import decoder_of
 from aquaflow.sources import RawTap
 from aquaflow.types import TelemetrySample, UtcTime

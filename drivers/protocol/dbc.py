@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from aquaflow.base.errors import ConfigError, load, reason_of
 from aquaflow.config.instruments import DbcConfig, DbcSignal
-from aquaflow.drivers.fixes import Fixes, Vector, from_euler, normalise, sigma_of
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+from aquaflow.drivers.samples import Fixes, Vector, from_euler, normalise, sigma_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
 from aquaflow.types import (
     Acceleration,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import MavlinkConfig
-from aquaflow.drivers.fixes import (
+from aquaflow.drivers.samples import (
     Fixes,
     Quaternion,
     from_euler,

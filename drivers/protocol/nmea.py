@@ -15,10 +15,9 @@ from operator import xor
 from typing import NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import NmeaConfig
-from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.link import about
 from aquaflow.drivers.protocol.packets import LineFraming, PacketDecoder
-from aquaflow.drivers.protocol.partial import PartialMotion
+from aquaflow.drivers.samples import Fixes, PartialMotion, sigma_of
 from aquaflow.types import Altitude, Depth, TelemetrySample, UtcTime
 
 # --------------------------------------------------------------------------------------------------

@@ -12,10 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from aquaflow.config.instruments import Nmea2000Config
-from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.dbc import CanFraming, frame_of
 from aquaflow.drivers.protocol.packets import PacketDecoder
-from aquaflow.drivers.protocol.partial import PartialMotion
+from aquaflow.drivers.samples import Fixes, PartialMotion, sigma_of
 from aquaflow.types import Altitude, TelemetrySample, UtcTime
 
 HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267

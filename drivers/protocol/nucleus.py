@@ -13,9 +13,9 @@ from functools import partial
 from typing import NamedTuple, TypeAlias
 
 from aquaflow.config.instruments import NucleusConfig
-from aquaflow.drivers.fixes import from_euler
 from aquaflow.drivers.link import DeviceClock
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+from aquaflow.drivers.samples import from_euler
 from aquaflow.types import (
     Acceleration,
     Altitude,

@@ -12,8 +12,8 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-from aquaflow.drivers.fixes import plausible
 from aquaflow.drivers.link import DeviceClock, LinkCounters
+from aquaflow.drivers.samples import plausible
 from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)

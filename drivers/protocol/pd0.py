@@ -14,9 +14,9 @@ from datetime import datetime
 from typing import NamedTuple
 
 from aquaflow.config.instruments import Pd0Config
-from aquaflow.drivers.fixes import Vector, from_euler, inverse, rotate
 from aquaflow.drivers.link import DeviceClock, about
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+from aquaflow.drivers.samples import Vector, from_euler, inverse, rotate
 from aquaflow.types import Altitude, TelemetrySample, Velocity
 
 log = logging.getLogger(__name__)

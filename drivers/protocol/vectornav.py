@@ -17,9 +17,9 @@ from operator import xor
 from typing import NamedTuple, TypeAlias
 
 from aquaflow.config.instruments import VectorNavConfig
-from aquaflow.drivers.fixes import Fixes, from_euler, normalise, sigma_of
 from aquaflow.drivers.link import DeviceClock
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+from aquaflow.drivers.samples import Fixes, from_euler, normalise, sigma_of
 from aquaflow.types import Acceleration, AngularRate, Attitude, TelemetrySample, UtcTime
 
 # --------------------------------------------------------------------------------------------------

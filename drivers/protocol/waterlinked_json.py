@@ -8,8 +8,8 @@ import re
 from typing import Any
 
 from aquaflow.config.instruments import WaterLinkedJsonConfig
-from aquaflow.drivers.fixes import from_euler
 from aquaflow.drivers.protocol.packets import LineFraming, PacketDecoder
+from aquaflow.drivers.samples import from_euler
 from aquaflow.types import Altitude, Attitude, TelemetrySample, Velocity
 
 LONGEST = 16_384

@@ -16,7 +16,7 @@ from aquaflow.config.link import (
 from aquaflow.drivers.link import ByteLink
 from aquaflow.drivers.transport.can import open_can
 from aquaflow.drivers.transport.mavlink2rest import Wants, open_mavlink2rest
-from aquaflow.drivers.transport.socket import open_serial, open_tcp, open_udp
+from aquaflow.drivers.transport.ports import open_serial, open_tcp, open_udp
 
 OpenLink: TypeAlias = Callable[[], ByteLink]
 """Opens a link anew; raises LinkLostError where the device or its peer is not there."""

@@ -18,7 +18,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import WriteModel, export_posed_pictures
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
-from aquaflow.survey.export.colmap import write_colmap, write_nerfstudio
+from aquaflow.survey.export.posed_pictures import write_colmap, write_nerfstudio
 from tests.mapping.mapping_scenes import CAMERA
 from tests.survey.export.small_dive import (
     FRAMES,

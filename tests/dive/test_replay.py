@@ -15,7 +15,7 @@ from aquaflow.base.errors import InputError, NotMappedError
 from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
-from aquaflow.recordings.synthetic_telemetry import SyntheticDive
+from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation

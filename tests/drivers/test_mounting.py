@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.stage import MountingConfig
-from aquaflow.drivers import fixes as rotation
-from aquaflow.drivers.fixes import plausible
+from aquaflow.drivers import samples as rotation
 from aquaflow.drivers.mounting import BodyFrame, Mounting
+from aquaflow.drivers.samples import plausible
 from aquaflow.types import (
     Acceleration,
     Altitude,

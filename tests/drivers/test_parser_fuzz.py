@@ -12,9 +12,9 @@ from pathlib import Path
 import can
 import pytest
 
-from aquaflow.drivers.fixes import plausible
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.samples import plausible
 from aquaflow.drivers.telemetry import decoder_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD, pack
 from aquaflow.sim_drivers.devices.nmea_talker import sentence

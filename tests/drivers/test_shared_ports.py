@@ -17,7 +17,7 @@ from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.link import LinkLostError
 from aquaflow.drivers.shared_ports import PortDivision
 from aquaflow.drivers.telemetry import LinkTelemetry, decoder_of
-from aquaflow.drivers.transport.socket import MOST_WAITING, SharedUdp
+from aquaflow.drivers.transport.ports import MOST_WAITING, SharedUdp
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.nmea_talker import NmeaTalker, sentence

@@ -16,7 +16,7 @@ from aquaflow.config.link import CanConfig, SerialConfig, TcpConfig, UdpConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
 from aquaflow.drivers.transport import opener
 from aquaflow.drivers.transport.can import EXTENDED, RECORD, open_can
-from aquaflow.drivers.transport.socket import open_serial, open_tcp, open_udp
+from aquaflow.drivers.transport.ports import open_serial, open_tcp, open_udp
 from aquaflow.sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
 from tests.drivers.simulated_links import free_port, until
 

@@ -17,9 +17,9 @@ from aquaflow.lab.synthetic.telemetry import HEADER
 from aquaflow.live.recorder.writing import encode
 from aquaflow.recordings.csv_telemetry import CsvTelemetry
 from aquaflow.recordings.dataflash import Dataflash
+from aquaflow.recordings.link_logs import Tlog
 from aquaflow.recordings.mcap_camera import OURS, McapCamera
 from aquaflow.recordings.mcap_messages import McapMessages
-from aquaflow.recordings.tlog import Tlog
 from aquaflow.types import Acceleration, Depth
 
 ZEROS = bytes(1 << 22)

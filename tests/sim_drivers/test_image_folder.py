@@ -11,7 +11,7 @@ from PIL import Image
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.recordings.images import ImageFolder
-from aquaflow.recordings.synthetic_telemetry import SyntheticDive
+from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.types import Dropped, Frame
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

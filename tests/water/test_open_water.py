@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.water.open_water import open_water
+from aquaflow.water.open_sightings import open_water
 
 B_INF = np.broadcast_to(np.float32([0.1, 0.3, 0.4]), (60, 80, 3))
 

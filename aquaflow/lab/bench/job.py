@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
+import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.config import Config, parse_config
 from aquaflow.config.presets import merge, preset
 from aquaflow.lab.bench.scene import BenchmarkScene
@@ -49,3 +53,20 @@ class BenchJob:
         """The job that :meth:`to_text` wrote."""
         data = json.loads(text)
         return BenchJob(**{**data, "scene": BenchmarkScene(**data["scene"])})
+
+
+# --------------------------------------------------------------------------------------------------
+# How a process of a benchmark answers: a job comes in on stdin, its row goes out on stdout.
+
+AnyJob = TypeVar("AnyJob")
+
+
+def answer(from_text: Callable[[str], AnyJob], perform: Callable[[AnyJob], dict[str, Any]]) -> None:
+    """Print the row of one job as JSON; of one that failed, the sentence that says why."""
+    logging.captureWarnings(True)
+    job = from_text(sys.stdin.read())
+    try:
+        row = perform(job)
+    except AquaFlowError as error:
+        row = {"failed": str(error)}
+    print(json.dumps(row))

@@ -13,8 +13,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError, NotMappedError
 from aquaflow.geometry.camera import load_camera
-from aquaflow.lab.bench.answer import answer
-from aquaflow.lab.bench.job import BenchJob
+from aquaflow.lab.bench.job import BenchJob, answer
 from aquaflow.lab.bench.memory import peak_memory_mb
 from aquaflow.lab.bench.peers import run_peer
 from aquaflow.lab.bench.scene import BenchmarkScene

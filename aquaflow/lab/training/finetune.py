@@ -22,7 +22,7 @@ from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.lab.training.datasets.chaining import chain
 from aquaflow.lab.training.datasets.colmap import colmap
 from aquaflow.lab.training.datasets.posed import Frames, Posed, nothing_in, read_image
-from aquaflow.lab.training.datasets.tartanair import mimir, tartanair
+from aquaflow.lab.training.datasets.simulated import mimir, tartanair
 from aquaflow.lab.training.datasets.uwstereo import uwstereo
 from aquaflow.lab.training.losses import Losses, LossWeights, pair_loss
 from aquaflow.lab.training.mining import MinedPairs, load_index, mine, save_index

@@ -19,7 +19,7 @@ from aquaflow.lab.synthetic import (
     simulate,
     write_dive,
 )
-from aquaflow.recordings.synthetic_telemetry import SyntheticDive
+from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.types import Altitude, AngularRate, Attitude, Depth, Velocity
 from tests.lab.synthetic.without_errors import WITHOUT_ERRORS
 

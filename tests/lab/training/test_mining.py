@@ -13,7 +13,7 @@ import torch
 from aquaflow.base.errors import InputError
 from aquaflow.lab.training import mining
 from aquaflow.lab.training.datasets.posed import Frames, Posed
-from aquaflow.lab.training.datasets.tartanair import tartanair
+from aquaflow.lab.training.datasets.simulated import tartanair
 from aquaflow.lab.training.mining import (
     MinedPairs,
     is_moved,

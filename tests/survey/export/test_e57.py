@@ -17,7 +17,7 @@ from aquaflow.cli import app
 from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.point_cloud import CloudPoints, read_point_cloud
-from aquaflow.survey.export.e57 import COLOURS, NORMALS, POSITIONS, SIGMA, write_e57
+from aquaflow.survey.export.point_clouds import COLOURS, NORMALS, POSITIONS, SIGMA, write_e57
 from tests.survey.export.small_dive import north_up_frame, write_small_dive
 
 pye57 = pytest.importorskip("pye57", reason="pye57 has no wheel for this machine")

@@ -18,7 +18,7 @@ from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.point_cloud import nearest_cameras, read_point_cloud, read_posed_views
-from aquaflow.survey.export.e57 import write_laz
+from aquaflow.survey.export.point_clouds import write_laz
 from tests.survey.export.small_dive import (
     ORIGIN,
     SCALE,

@@ -24,8 +24,8 @@ from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.views import open_finished
 from aquaflow.geometry.arrays import Arrays, add_prefix, of_sim3
-from aquaflow.lab.bench.answer import answer
 from aquaflow.lab.bench.growth.job import THREADS, GrowthJob
+from aquaflow.lab.bench.job import answer
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
 from aquaflow.lab.synthetic.survey import SurveyPictures
 from aquaflow.mapping import state

@@ -12,7 +12,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.lab.training.datasets.colmap import colmap
 from aquaflow.lab.training.datasets.posed import Frames
-from aquaflow.lab.training.datasets.tartanair import mimir, read_exr, tartanair
+from aquaflow.lab.training.datasets.simulated import mimir, read_exr, tartanair
 from aquaflow.lab.training.datasets.uwstereo import uwstereo
 from aquaflow.lab.training.finetune import flsea
 from tests.lab.training.data_trees import (
