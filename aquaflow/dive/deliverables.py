@@ -46,8 +46,15 @@ from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, depths_at
-from aquaflow.keyframes.places_file import EDGE, NAME, Rows, write_places
+from aquaflow.keyframes.place import (
+    EDGE,
+    NAME,
+    KeyframePlace,
+    KeypointDepths,
+    Rows,
+    depths_at,
+    write_places,
+)
 from aquaflow.slam import Slam
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked

@@ -26,8 +26,8 @@ from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.dive.tum import Trajectory, associate, read_tum
 from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.keyframes.places_file import NAME as PLACES
-from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.keyframes.place import NAME as PLACES
+from aquaflow.keyframes.place import PlacesFile
 from aquaflow.telemetry.metric_file import read_main, read_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 

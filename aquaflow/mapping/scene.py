@@ -21,9 +21,9 @@ from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
 from aquaflow.water.exposure import gain_of, learn_gain
 from aquaflow.water.medium import LearnedMedium, WaterParameters
+from aquaflow.water.model import TERMS, gain_map
 from aquaflow.water.nearest import Nearest
 from aquaflow.water.open_sightings import open_water
-from aquaflow.water.parameters import TERMS, gain_map
 from aquaflow.water.sunlight import Sunlight
 from aquaflow.water.white_balance import Recovered, WhiteBalance
 

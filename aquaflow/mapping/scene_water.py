@@ -22,9 +22,9 @@ from aquaflow.render.views import View, in_time
 from aquaflow.water.estimation import WaterEstimate, estimating, models_for
 from aquaflow.water.exposure import gain_of, log_gains_of, set_log_gains
 from aquaflow.water.medium import WaterParameters
+from aquaflow.water.model import shading_basis
 from aquaflow.water.nearest import kept_by
 from aquaflow.water.observations import run_to_end
-from aquaflow.water.parameters import shading_basis
 from aquaflow.water.sightings import PosedPicture, sighting
 
 

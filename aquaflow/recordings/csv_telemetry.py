@@ -1,5 +1,5 @@
 """Tables of telemetry: what ``aquaflow lab synth`` writes, ``rostopic echo -p``, GoPro extracts,
-and plain tables of a survey (:mod:`aquaflow.recordings.survey_table`)."""
+and plain tables of a survey (:mod:`aquaflow.recordings.csv_telemetry`)."""
 
 from __future__ import annotations
 
@@ -8,14 +8,24 @@ import csv
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
 
 from aquaflow.base.errors import InputError
-from aquaflow.recordings import survey_table
+from aquaflow.drivers.samples import from_euler, plausible, sigma_of
 from aquaflow.recordings.sample_table import HEADER, read_telemetry
 from aquaflow.recordings.telemetry_log import LoggedUtc, LogTime, TelemetryLog
-from aquaflow.types import Acceleration, Altitude, AngularRate, Depth, TelemetrySample, Velocity
+from aquaflow.types import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Attitude,
+    Depth,
+    Position,
+    TelemetrySample,
+    Velocity,
+)
 
 Line: TypeAlias = dict[str, str]
 Convert: TypeAlias = Callable[[Line, int, int, str], list[TelemetrySample]]
@@ -77,7 +87,7 @@ class CsvTelemetry(TelemetryLog):
                 try:
                     if time is None:
                         raise ValueError("no time")
-                    found = survey_table.samples_of(row, time[0], source)
+                    found = samples_of(row, time[0], source)
                 except (TypeError, ValueError):
                     bad += 1
                     continue
@@ -94,11 +104,11 @@ class CsvTelemetry(TelemetryLog):
         ):
             for row in csv.DictReader(file):
                 try:
-                    if survey_table.UTC in row:
-                        wall_ns = survey_table.utc_ns(row[survey_table.UTC])
+                    if UTC in row:
+                        wall_ns = utc_ns(row[UTC])
                         yield clock.at(wall_ns), wall_ns
                         continue
-                    t_s = self.starts_s + float(row[survey_table.SECONDS])
+                    t_s = self.starts_s + float(row[SECONDS])
                     newest_ns = max(newest_ns, round(t_s * 1e9))
                     yield newest_ns, None
                 except (AttributeError, TypeError, ValueError, OverflowError):
@@ -132,7 +142,7 @@ def _reader_of(path: Path) -> Reader | None:
     stream = path.stem.rpartition("_")[2]
     known: list[tuple[bool, Reader]] = [
         (header == HEADER, _synthetic),
-        (survey_table.is_survey_table(header), CsvTelemetry.survey),
+        (is_survey_table(header), CsvTelemetry.survey),
         (ros and "field.depth" in header, lambda table: table.lines(_ros_depth, _ros_stamps)),
         (
             ros and "field.velocityInst0" in header,
@@ -202,3 +212,62 @@ def _gopro_rate(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[Tel
 
 def _gopro_force(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
     return [Acceleration(t_ns, arrival_ns, source, _gopro_body(line))]
+
+
+# --------------------------------------------------------------------------------------------------
+# Rows of a plain table of telemetry, with the quantities of a survey's log by the header.
+#
+# A row has a time, ``t_s`` (seconds after the recording's first picture) or ``utc`` (ISO 8601,
+# UTC where it states no offset), and any of the columns of ``QUANTITIES``. Empty cells say
+# nothing.
+
+SECONDS, UTC = "t_s", "utc"
+"""Columns with a row's time; a table has one of them."""
+PLACE = ("latitude_deg", "longitude_deg")
+ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
+QUANTITIES = (*PLACE, "sigma_m", "depth_m", *ANGLES, "altitude_m")
+"""Columns with what was measured, in any order."""
+
+Row: TypeAlias = dict[str, str]
+
+
+def is_survey_table(header: tuple[str, ...]) -> bool:
+    """True if every column is known, one is a time, and something was measured."""
+    columns = set(header)
+    times, measured = columns & {SECONDS, UTC}, columns & set(QUANTITIES) - {"sigma_m"}
+    return len(times) == 1 and bool(measured) and columns == times | (columns & set(QUANTITIES))
+
+
+def utc_ns(text: str) -> int:
+    """Nanoseconds since 1970 of an ISO 8601 time, to the microsecond.
+
+    Raises:
+        ValueError: it is none.
+    """
+    moment = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    aware = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    since = aware - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    return 1000 * ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds)
+
+
+def samples_of(row: Row, t_ns: int, source: str) -> list[TelemetrySample]:
+    """Samples of one row; angles make an attitude only together.
+
+    Raises:
+        ValueError: a cell holds no number, or one that no vehicle can have.
+    """
+    known = {name: float(row[name]) for name in QUANTITIES if (row.get(name) or "").strip()}
+    stamp = (t_ns, t_ns, source)
+    found: list[TelemetrySample] = []
+    if known.keys() >= set(PLACE):
+        place = known["latitude_deg"], known["longitude_deg"]
+        found.append(Position(*stamp, *place, known.get("sigma_m", sigma_of(None))))
+    if "depth_m" in known:
+        found.append(Depth(*stamp, known["depth_m"]))
+    if known.keys() >= set(ANGLES):
+        found.append(Attitude(*stamp, from_euler(*(math.radians(known[a]) for a in ANGLES))))
+    if "altitude_m" in known:
+        found.append(Altitude(*stamp, known["altitude_m"]))
+    if not all(map(plausible, found)):
+        raise ValueError("no vehicle can have these values")
+    return found

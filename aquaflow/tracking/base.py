@@ -23,8 +23,7 @@ from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes import KeyframeStore, Pointmap
-from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, depths_at
-from aquaflow.keyframes.places_file import NAME, PlacesFile
+from aquaflow.keyframes.place import NAME, KeyframePlace, KeypointDepths, PlacesFile, depths_at
 from aquaflow.optimise.least_squares import NormalEquations, Rules, covariance_of, minimise
 from aquaflow.optimise.robust import Huber
 from aquaflow.prior.contract import Encoding

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from aquaflow.config import MediumConfig
 from aquaflow.render.water import BANDS, MAX_OPTICAL_DEPTH, sinusoidal_encoding
-from aquaflow.water.parameters import TERMS
+from aquaflow.water.model import TERMS
 
 MIN_RATE = 1e-4
 """1 / map unit; a rate of zero has no finite parameter."""

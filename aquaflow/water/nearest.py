@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.water.model import WaterModel
+from aquaflow.water.model import Trial, WaterModel
 from aquaflow.water.observations import PICTURES_AT_ONCE, Observations
 from aquaflow.water.open_sightings import WINDOW_PX, open_area
-from aquaflow.water.parameters import Trial
 from aquaflow.water.sightings import PosedPicture
 from aquaflow.water.white_balance import WhiteBalance
 

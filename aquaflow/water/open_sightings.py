@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.water.model import Trial, gain_map
 from aquaflow.water.observations import PICTURES_AT_ONCE, Observations
-from aquaflow.water.parameters import Trial, gain_map
 from aquaflow.water.sightings import PosedPicture
 
 Array = npt.NDArray[np.float64]

@@ -14,8 +14,7 @@ from aquaflow.config import Config
 from aquaflow.dive import deliverables as places_of_dive
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeyframePlace
-from aquaflow.keyframes.places_file import NAME, PlacesFile, Rows
+from aquaflow.keyframes.place import NAME, KeyframePlace, PlacesFile, Rows
 from aquaflow.keyframes.store import Keyframe
 from aquaflow.sources import open_recording
 from aquaflow.telemetry.metric_file import read_metric_file

@@ -234,7 +234,7 @@ PLACES_BOMBS = {"index": 3_000_000, "edges": 1_000_000, "about": 1 << 29}
 
 @pytest.mark.parametrize("name", PLACES_BOMBS)
 def test_places_that_unpack_to_gigabytes_take_no_memory(dive: Path, name: str) -> None:
-    from aquaflow.keyframes.places_file import EDGE, PLACE
+    from aquaflow.keyframes.place import EDGE, PLACE
 
     usual, code, said = peak_mb("site", "add", dive.parent / "a", dive)
     assert code == 0, said
@@ -250,7 +250,7 @@ def test_places_that_unpack_to_gigabytes_take_no_memory(dive: Path, name: str) -
 def test_a_dive_is_not_looked_for_in_places_that_unpack_to_gigabytes(
     dive: Path, pictures: Path, tmp_path: Path
 ) -> None:
-    from aquaflow.keyframes.places_file import EDGE
+    from aquaflow.keyframes.place import EDGE
 
     usual, _, said = peak_mb("map", pictures, "--out", tmp_path / "a", "--in", tmp_path / "none")
     replaced(dive / "places.npz", "edges", EDGE, PLACES_BOMBS["edges"])

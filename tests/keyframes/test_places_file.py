@@ -13,15 +13,19 @@ from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import (
+    EDGE,
     LARGEST_ROOT,
     LEVELS,
+    NAME,
     UNKNOWN_VARIANCE,
     KeyframePlace,
     KeypointDepths,
+    PlacesFile,
+    Rows,
     pack,
     unpack,
+    write_places,
 )
-from aquaflow.keyframes.places_file import EDGE, NAME, PlacesFile, Rows, write_places
 from aquaflow.prior.contract import Keypoints
 
 CAMERA = CameraModel(160, 120, 130.0, 131.0, 80.5, 60.0)

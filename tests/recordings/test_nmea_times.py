@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.recordings.nmea_text import NmeaText
+from aquaflow.recordings.link_logs import NmeaText
 
 
 @pytest.mark.parametrize(

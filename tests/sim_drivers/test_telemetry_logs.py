@@ -17,9 +17,8 @@ from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.recordings.csv_telemetry import CsvTelemetry
 from aquaflow.recordings.dataflash import Dataflash
 from aquaflow.recordings.images import ImageFolder
-from aquaflow.recordings.link_logs import Candump, Tlog
+from aquaflow.recordings.link_logs import Candump, NmeaText, Tlog
 from aquaflow.recordings.manifest import ManifestTelemetry
-from aquaflow.recordings.nmea_text import NmeaText
 from aquaflow.recordings.telemetry_log import LogTime
 from aquaflow.sources import (
     mounting_of,

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.lab.synthetic.water import WATER_TYPES
+from aquaflow.water.model import shading_basis
 from aquaflow.water.observations import Observations
-from aquaflow.water.parameters import shading_basis
 
 Array = npt.NDArray[np.float64]
 

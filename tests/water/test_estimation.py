@@ -14,14 +14,14 @@ from aquaflow.water.estimation import (
     EVERY_MODEL,
     MIN_POINTS,
     WaterEstimate,
+    cost,
+    descend,
     estimating,
     models_for,
     without,
 )
-from aquaflow.water.model import WaterModel
+from aquaflow.water.model import TERMS, Model, WaterModel, shading_basis
 from aquaflow.water.observations import Observations, run_to_end
-from aquaflow.water.parameters import TERMS, Model, shading_basis
-from aquaflow.water.solver import cost, descend
 from tests.water.water_observations import (
     B_INF,
     B_RES,

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.water.model import WaterModel
+from aquaflow.water.estimation import normal_equations
+from aquaflow.water.model import EXPOSURE_SIGMA, TERMS, Model, WaterModel
 from aquaflow.water.observations import Observations
-from aquaflow.water.parameters import EXPOSURE_SIGMA, TERMS, Model
-from aquaflow.water.solver import normal_equations
 from tests.water.water_observations import B_RES, D
 
 POINTS, SIGHTINGS, VIEWS = 40, 4, 5

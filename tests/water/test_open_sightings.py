@@ -12,9 +12,9 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water.estimation import estimating
+from aquaflow.water.model import Trial
 from aquaflow.water.observations import run_to_end
 from aquaflow.water.open_sightings import COLUMNS, ROWS, with_open_water
-from aquaflow.water.parameters import Trial
 from aquaflow.water.sightings import PosedPicture
 from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 

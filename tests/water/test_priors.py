@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.water.model import BRIGHT_LEVEL, DARK_LEVEL, WaterModel, beliefs
-from aquaflow.water.parameters import Model
-from aquaflow.water.solver import cost, normal_equations, weights
+from aquaflow.water.estimation import cost, normal_equations, weights
+from aquaflow.water.model import BRIGHT_LEVEL, DARK_LEVEL, Model, WaterModel, beliefs
 from tests.water.water_observations import B_RES, D, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False, "regions": False}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.water.parameters import MAX_LOG_GAIN, TERMS, gain_map, shading_basis
+from aquaflow.water.model import MAX_LOG_GAIN, TERMS, gain_map, shading_basis
 
 
 def test_the_centre_of_the_picture_has_gain_one_whatever_the_coefficients() -> None:

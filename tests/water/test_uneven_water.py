@@ -9,7 +9,7 @@ import numpy as np
 
 from aquaflow.config import MediumConfig
 from aquaflow.water.estimation import EVERY_MODEL, WaterEstimate, models_for
-from aquaflow.water.parameters import TERMS, Model, shading_basis
+from aquaflow.water.model import TERMS, Model, shading_basis
 from tests.water.water_observations import B_INF, BETA, LAMP, B, fitted, sighted
 
 BRIGHTER_ABOVE = np.array([0.0, -0.7, 0.0, 0.0, 0.1])

@@ -12,9 +12,9 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water.medium import WaterParameters
+from aquaflow.water.model import Trial
 from aquaflow.water.nearest import GAINS, Nearest, kept_by, nearest_of
 from aquaflow.water.observations import run_to_end
-from aquaflow.water.parameters import Trial
 from aquaflow.water.sightings import PosedPicture
 from aquaflow.water.white_balance import WhiteBalance
 from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted

@@ -9,9 +9,8 @@ import numpy.typing as npt
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.water.estimation import EVERY_MODEL, WaterEstimate, estimating
-from aquaflow.water.model import BELIEVED
+from aquaflow.water.model import BELIEVED, Model, shading_basis
 from aquaflow.water.observations import Observations, run_to_end
-from aquaflow.water.parameters import Model, shading_basis
 
 Array = npt.NDArray[np.float64]
 BETA = np.array([0.6, 0.3, 0.2])

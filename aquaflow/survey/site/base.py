@@ -9,8 +9,7 @@ from pathlib import Path
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
-from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, PlacesFile
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
 from aquaflow.survey.site.merged_file import MergedSite, merge_of

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
-from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.keyframes.place import NAME as PLACES
 from aquaflow.survey.site.manifest import SiteDive, read_site, state_of
 from aquaflow.survey.site.merged_file import MergedSite, read_merged
 

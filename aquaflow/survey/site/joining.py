@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from aquaflow.config import GraphConfig, RetrievalConfig, VerificationConfig
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
-from aquaflow.keyframes.place import KeyframePlace
-from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.keyframes.place import KeyframePlace, PlacesFile
 from aquaflow.survey.site.joint_graph import LEAST_TRUST, JointGraph
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.loop_admission import Chains, gap_chi2

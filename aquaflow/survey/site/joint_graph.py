@@ -14,8 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeyframePlace
-from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.keyframes.place import KeyframePlace, PlacesFile
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 

@@ -12,7 +12,7 @@ from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json, sha256_regular
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.dive.dive import Dive
-from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.keyframes.place import NAME as PLACES
 from aquaflow.telemetry.metric_file import NAME as METRIC
 
 NAME = "site.json"

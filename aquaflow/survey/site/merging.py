@@ -24,7 +24,7 @@ from aquaflow.base.storage.atomic import make_subfolder, open_to_append, write_j
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.keyframes.place import PlacesFile
 from aquaflow.survey.site.joining import CrossLink, find_links, join
 from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_of
 from aquaflow.survey.site.manifest import NAME, SiteDive, add_dives, read_site, state_of

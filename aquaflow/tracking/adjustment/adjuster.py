@@ -31,8 +31,13 @@ from aquaflow.tracking.adjustment.equations import (
     sampled_points,
     see_each_other,
 )
-from aquaflow.tracking.adjustment.joint import JointAdjustmentResult, JointProblem, adjust
-from aquaflow.tracking.adjustment.solver import covariance, of_edge
+from aquaflow.tracking.adjustment.joint import (
+    JointAdjustmentResult,
+    JointProblem,
+    adjust,
+    covariance,
+    of_edge,
+)
 from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.pose_graph import Edge

@@ -11,8 +11,7 @@ from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
-from aquaflow.keyframes.places_file import EDGE, NAME, write_places
+from aquaflow.keyframes.place import EDGE, NAME, KeyframePlace, KeypointDepths, write_places
 from aquaflow.prior.contract import Keypoints
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.keyframes.places_file import NAME, PlacesFile
+from aquaflow.keyframes.place import NAME, PlacesFile
 from aquaflow.survey.site.merging import add_to_site, merge
 from aquaflow.tracking.base import base_of
 

@@ -12,7 +12,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.dive.tum import read_tum
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.keyframes.place import NAME as PLACES
 from aquaflow.survey.site import merging
 from aquaflow.survey.site.checking import check_site
 from aquaflow.survey.site.joining import CrossLink

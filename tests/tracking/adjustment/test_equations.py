@@ -15,7 +15,7 @@ from aquaflow.tracking.adjustment.equations import (
     equations_and_scores,
     project,
 )
-from aquaflow.tracking.adjustment.solver import BlockPattern, BundleState, cost_of, linearise
+from aquaflow.tracking.adjustment.joint import BlockPattern, BundleState, cost_of, linearise
 from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
 
 STEP = 1e-6

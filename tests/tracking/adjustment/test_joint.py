@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
-from aquaflow.tracking.adjustment import solver
+from aquaflow.tracking.adjustment import joint as solver
 from aquaflow.tracking.adjustment.equations import (
     AnchorEquations,
     AnchorMatches,
     anchor_equations,
 )
-from aquaflow.tracking.adjustment.joint import adjust, triangulate, verdict
-from aquaflow.tracking.adjustment.solver import covariance
+from aquaflow.tracking.adjustment.joint import adjust, covariance, triangulate, verdict
 from tests.tracking.adjustment.adjustment_scenes import NOISE, Array, apart, scene, shaken
 
 
