@@ -1,4 +1,7 @@
-"""AquaFlow, the algorithm: frames in, poses and maps out. No clocks decide a replay's results."""
+"""AquaFlow, the algorithm: frames in, poses and maps out. No clocks decide a replay's results.
+
+:class:`Slam` is one frame's way through tracking and mapping; below it stand what a frame gives to
+the maps, and how long the end of a dive may take."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Byte links to devices: the protocols of transports and decoders, and the counters."""
+"""Byte links to devices: protocols of transports and decoders, counters, events, device clocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fixes on the earth as samples: how old they are, how accurate, and moved by a lever arm."""
+"""What decoders make of numbers: fixes on the earth, limits, rotations, partial measurements."""
 
 from __future__ import annotations
 

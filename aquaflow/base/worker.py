@@ -2,7 +2,8 @@
 
 Tracking asks for what no pose waits for (loops, keyframes to return to, frames of the past), and
 the keyframe graph starts one long optimisation after the other. Neither knows where the work is
-done: results are plain data, taken in the order of asking.
+done: results are plain data, taken in the order of asking. How many threads there may be, and how a
+signal ends a long run, is said here too.
 """
 
 from __future__ import annotations

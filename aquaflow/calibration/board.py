@@ -1,4 +1,4 @@
-"""Boards to calibrate with: ChArUco and grids of AprilTags, found in pictures and printed."""
+"""Boards to calibrate with: ChArUco and AprilTags, printed, found, and which views count."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is here and what a run would use: ``doctor``, ``doctor devices``, ``config``."""
+"""What is here, and what would be used: ``doctor``, ``doctor devices``, ``config``, ``inspect``."""
 
 from __future__ import annotations
 

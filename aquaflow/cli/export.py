@@ -1,4 +1,4 @@
-"""The commands that make files of a dive: ``export``, ``export report``. Thin, like all of cli/."""
+"""The commands that make files of a dive: ``export``, report and video. Thin, as all of cli/."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command that measures in a finished dive: ``measure``. Thin, like all of cli/."""
+"""The commands that measure in a dive: ``measure``, ``measure scale``. Thin, as all of cli/."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands of the two-view prior, thin like all of cli/."""
+"""The commands that train, describe and check two-view priors. Thin, as all of cli/."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of live cameras: one model for each kind of driver, selected by ``kind``."""
+"""Settings of live cameras, by the ``kind`` of their driver, and of a source's pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of instruments with a protocol of their own: velocity logs, echo sounders, AHRS."""
+"""Settings of instruments: velocity logs, echo sounders, AHRS, and devices on a CAN bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Settings of the onboard service: dives, survival, health, and what it may take of the machine."""
+"""Settings of the onboard service: dives, survival, health, recorder, viewer, coverage, and what it
+may take of the machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all settings have in common: refused misspellings, and which of them are no user's."""
+"""What all settings have in common: refused misspellings, old keys, what is the lab's, devices."""
 
 from __future__ import annotations
 

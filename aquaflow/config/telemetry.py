@@ -1,4 +1,4 @@
-"""Settings of a vehicle's telemetry: its autopilot, and every other device by its kind."""
+"""Settings of a vehicle's telemetry: its devices by their kind, its fusion, and known lengths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of tracking (paper, Sec. 3.2)."""
+"""Settings of tracking (paper, Sec. 3.2) and of the two-view prior."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What leaves a dive, in n: the sub-maps' metric frames, computed once at the end of the dive."""
+"""What leaves a dive, in n: its sub-maps' metric frames, and the rows of trajectory.csv."""
 
 from __future__ import annotations
 

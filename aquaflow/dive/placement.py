@@ -1,4 +1,4 @@
-"""Coordinates of what other programs get: z up, and on the UTM grid where the earth is known.
+"""Where a dive lies: upright, on the earth and its UTM grid, on a page, and in an earlier dive.
 
 The upright frame u has the origin and the unit of n (docs/conventions.md#world-n). Where gravity is
 known its axes are right, forward and up of what n's x axis points to: east, north, up where that is
@@ -94,7 +94,7 @@ def placement(frame: WorldFrame) -> Placement:
 # --------------------------------------------------------------------------------------------------
 # The UTM grid that what a dive exports is laid on, where the dive's place on the earth is known.
 #
-# Points of n are in metres north, east and down of the dive's origin (georeference.py). The zone is
+# Points of n are in metres north, east and down of the dive's origin. The zone is
 # that of the origin, for all points.
 
 LATITUDES_OF_UTM = (-80.0, 84.0)

@@ -1,4 +1,4 @@
-"""The surface of a dive's map as points: where a Gaussian stands, in what colour, facing where."""
+"""A dive's map as others take it: points of its surface, and its views, in the upright frame."""
 
 from __future__ import annotations
 

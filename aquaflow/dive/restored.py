@@ -1,4 +1,4 @@
-"""The frames of a dive without their water, as pictures."""
+"""The pictures of a dive: without their water, as they were recorded, and with poses and points."""
 
 from __future__ import annotations
 

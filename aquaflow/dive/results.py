@@ -1,4 +1,4 @@
-"""Results of a finished run: poses, water and metrics.json's numbers."""
+"""Results of a finished run: poses, water (medium.json) and metrics.json's numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processor, memory, compiler, renderer and disk."""
+"""Processor, memory, compiler, renderer, disk, and optional packages."""
 
 from __future__ import annotations
 

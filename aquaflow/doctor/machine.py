@@ -1,4 +1,4 @@
-"""The machine as the doctor sees it: files below a root that tests replace; nothing is opened."""
+"""The machine as the doctor sees it, below a root that tests replace; what its GPU is used for."""
 
 from __future__ import annotations
 

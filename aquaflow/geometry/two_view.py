@@ -1,4 +1,4 @@
-"""Relative pose of two calibrated views from matches: essential matrix against homography.
+"""Two calibrated views: their relative pose from matches, epipolar distances, and depth.
 
 A flat sea floor makes the essential matrix ambiguous, relief makes the homography wrong; both are
 estimated, and the caller judges the candidates by how well they explain the points.

@@ -1,4 +1,4 @@
-"""What a finished dive keeps of a keyframe, so that its place can be recognised another day.
+"""What a finished dive keeps of its keyframes, to recognise a place another day: ``places.npz``.
 
 Descriptors are kept in four bits for each number. They are only ever compared after the square
 root of each number's share in the whole was taken (RootSIFT), and it is that root which is rounded.

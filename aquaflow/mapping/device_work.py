@@ -3,7 +3,7 @@
 Nothing else knows of that: work on a map is asked for by :meth:`DeviceWork.do` or
 :meth:`DeviceWork.change`. Where the device's memory is full, work that may be left out is, and the
 maps stay where they are. Other work, such as a correction, and all work that fails because the
-device is gone, is done again on the CPU, where all maps go on (see host_copies.py).
+device is gone, is done again on the CPU, where all maps go on.
 """
 
 from __future__ import annotations

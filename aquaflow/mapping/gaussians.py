@@ -1,4 +1,4 @@
-"""The Gaussians of one sub-map: explicit parameters, each tied to the keyframe that saw it."""
+"""The Gaussians of one sub-map, each tied to the keyframe that saw it: inserted, moved with it."""
 
 from __future__ import annotations
 

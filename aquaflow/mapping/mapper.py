@@ -178,7 +178,7 @@ class Mapper:
     # --- following the keyframes --------------------------------------------------------------
 
     def move(self, moves: Mapping[int, Sim3]) -> None:
-        """Let Gaussians and views follow moved keyframes (see gaussians/reanchoring.py)."""
+        """Let Gaussians and views follow moved keyframes (see gaussians.py)."""
         moved = move_gaussians(self.gaussians, moves)
         if self.neural is not None:
             self.neural.move(moved)

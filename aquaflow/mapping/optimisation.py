@@ -1,4 +1,4 @@
-"""One step of the joint optimisation of Gaussians, medium and pose (paper, Sec. 3.4).
+"""The joint optimisation of Gaussians, medium and pose (paper, Sec. 3.4): steps, loss, poses.
 
 It owns the optimisers' state, which has a row for every Gaussian; Gaussians are therefore added and
 dropped through it.

@@ -1,4 +1,4 @@
-"""A user's depth network as a prior folder: its file, what it takes and gives, and a test run."""
+"""A user's depth network as a prior folder: what it takes and gives, a test run, and its proof."""
 
 from __future__ import annotations
 

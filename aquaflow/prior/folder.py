@@ -1,4 +1,4 @@
-"""A prior on disk: ``encoder.onnx``, ``decoder.onnx``, and ``prior.json`` to vouch for them."""
+"""A prior on disk: ``encoder.onnx``, ``decoder.onnx``, and its card, ``prior.json``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a network is to the hybrid prior: a describer of pictures, and what it says of two."""
+"""What a network is to the hybrid prior: a describer of pictures, and what it says of ranges."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Tables of telemetry: what ``aquaflow lab synth`` writes, ``rostopic echo -p``, GoPro extracts,
-and plain tables of a survey (:mod:`aquaflow.recordings.csv_telemetry`)."""
+and plain tables of a survey."""
 
 from __future__ import annotations
 

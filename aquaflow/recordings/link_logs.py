@@ -1,4 +1,4 @@
-"""MAVLink telemetry logs (.tlog): 64 bits of microseconds, big endian, before every packet."""
+"""Logs of single links: MAVLink (.tlog), CAN (candump) and NMEA 0183 as text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated instruments of a synthetic dive."""
+"""A synthetic dive as a recording: its pictures and its simulated instruments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled CPU renderer: a ctypes call inside an autograd function."""
+"""The CPU renderers: compiled, a ctypes call inside an autograd function, and torch only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera's path in one sub-map, at any moment between two of its poses."""
+"""The camera's path in one sub-map at any moment, and what telemetry measured then."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From one sub-map to the next without seeing anything: by DVL and attitude.
+"""How the body moved without seeing anything, by gyro, DVL and attitude.
 
 The body moves by the integral of R_nb v dt between the last pose of the one and the first pose of
 the other, with v from the DVL and R_nb from the attitude filter, whose constant heading error the

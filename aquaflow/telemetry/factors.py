@@ -1,4 +1,4 @@
-"""A source's residuals as a function of the state, with their derivatives."""
+"""Factors of telemetry: each source's residuals as a function of the state, with derivatives."""
 
 from __future__ import annotations
 

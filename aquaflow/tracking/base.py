@@ -1,4 +1,4 @@
-"""A dive in the base: looks its keyframes up, decides what is believed, and says where it lies.
+"""A dive in its base: looks keyframes up, decides which links to believe, says where the dive lies.
 
 Every keyframe is looked up once, and no frame waits for it. Few look-ups wait at a time: while they
 do, further keyframes go without.

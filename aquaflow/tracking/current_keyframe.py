@@ -1,4 +1,4 @@
-"""Tracking against the current keyframe; keyframe selection.
+"""Tracking against the current keyframe; what moves by itself there; keyframe selection.
 
 The paper makes a keyframe where the share of matches falls below a limit. That is right where the
 view has moved on, and only there: of a picture full of marine snow every match is missing too, and

@@ -1,4 +1,4 @@
-"""Tracking's result for a frame: its class, its pose, and the pose's quality."""
+"""Frames of tracking: the result of a finished one, and those that wait for a map."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ neighbours are alike, so that however many pixels are compared, they count as fe
 but for its weights, which follow from a noise of two parts, stated and own: its loop is three lines
 here, where ``optimise.minimise`` would need a problem of its own.
 
-Networks that know inverse depth up to scale and shift get their shift there as well (affine.py).
+Networks that know inverse depth up to scale and shift get their shift there as well.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SLOPE_SIGMA = 0.1
 """Of the logarithm from the picture's middle to its edge: a slope of 6 degrees over a floor seen
 straight down; a network that sees the floor's tilt errs by less."""
 SHIFT_SIGMA = 0.1
-"""Of what is left of a shift, over the median inverse depth: the most error that affine.py allows.
+"""Of what is left of a shift, over the median inverse depth: the most error that its fit allows.
 """
 HONESTY = (0.5, np.inf)
 """Bounds of the factor of the stated error. A tenth of the picture may happen to fit too well; an

@@ -1,4 +1,4 @@
-"""The normal equations of the self-calibrating bundle adjustment (``lens_adjustment``)."""
+"""Self-calibrating bundle adjustment: its keypoint matches, its normal equations, its solution."""
 
 from __future__ import annotations
 

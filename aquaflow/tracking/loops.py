@@ -1,4 +1,4 @@
-"""Relocalisation and loop detection: retrieval of similar keyframes, then verification."""
+"""Relocalisation and loops: similar keyframes are retrieved, then verified; neighbours by pose."""
 
 from __future__ import annotations
 

@@ -9,10 +9,10 @@ Lamps and lenses darken the picture towards its edge, and near ground is seen ne
 out, that looks like water. So does light that changes while the vehicle climbs. Sunlit water shines
 more brightly the less one looks down. And in air or clear water there is nothing to find at all.
 Which of the four are there is decided by the models' marginal likelihoods (Laplace's method) under
-stated priors, with errors that neighbours share counted once (solver.py).
+stated priors, with errors that neighbours share counted once.
 
-A dive is in water unless there is evidence for clear water, and the likeliest water would not show
-(clear.py). Where little can be seen of it, the usual water is taken, with its uncertainty.
+A dive is in water unless there is evidence for clear water, and the likeliest water would not
+show. Where little can be seen of it, the usual water is taken, with its uncertainty.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ MIN_POINTS = 100
 WATER_IS_USUAL = 5.0
 """Log odds for water before anything is seen: one dive in 150 is in air or in water as clear."""
 NEGLIGIBLE_DEPTH = 0.06
-"""Optical depth at the median range up to which no eye sees water: as much as maps lose anyway
-(clear.py)."""
+"""Optical depth at the median range up to which no eye sees water: as much as maps lose anyway."""
 VISIBLE_DEPTH = 0.12
 """Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
 scenes without water look like 0.02 to 0.05."""

@@ -2,7 +2,7 @@
 
 An observation of point p in view v is ``gain_v shade(x, y) (J_p T(z) + uneven(x, y) B(z))`` (paper,
 Eq. 12). The best J of every point is linear, so it is eliminated (variable projection); what
-remains lies in one vector (parameters.py).
+remains lies in one vector.
 """
 
 from __future__ import annotations

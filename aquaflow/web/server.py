@@ -1,4 +1,4 @@
-"""A web server in a thread of its own: uvicorn, with limits for each client.
+"""A web server in a thread of its own: uvicorn, with limits for each client and connection.
 
 Kept libraries do the protocol: h11 reads HTTP/1.1, uvicorn serves it. Imported when a server begins
 to listen, so that the command line does not wait for them.

@@ -1,4 +1,4 @@
-"""Finding packets in a stream of bytes, whatever else is in it.
+"""Finding packets and printable lines in a stream of bytes, whatever else is in it.
 
 Where a checksum fails, the search goes on one byte behind the packet's start and not behind its
 end: the length may be what was damaged, and good packets would be skipped with it.

@@ -1,4 +1,4 @@
-"""UDP and TCP sockets as byte links."""
+"""UDP and TCP sockets, one UDP port for several devices, and serial ports as byte links."""
 
 from __future__ import annotations
 

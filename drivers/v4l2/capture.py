@@ -1,4 +1,4 @@
-"""One opening of a V4L2 device: memory-mapped buffers, read without a copy."""
+"""One opening of a V4L2 device, memory-mapped and read without a copy; the live camera on it."""
 
 from __future__ import annotations
 

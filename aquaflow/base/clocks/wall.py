@@ -1,4 +1,6 @@
-"""The wall clock, watched: it jumps during dives, and nothing but the log depends on it."""
+"""The computer's clocks: the wall clock, which jumps during dives, and moments to be done by.
+
+Nothing but the log depends on the wall clock; what must end in time follows the monotonic one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of a folder that others may have made: only regular files that lie inside it are opened.
+"""Files that others may have made: only regular ones inside their folder are opened, YAML is plain.
 
 A link in such a folder may lead to any file of the reader's, and a FIFO or a device may block for
 ever. The folder itself is named by the user, who may name a link. Hard links are files like others.

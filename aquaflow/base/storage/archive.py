@@ -1,4 +1,4 @@
-"""Zip archives, of arrays or of other members, from a folder that others may have made.
+"""Archives of arrays and facts, of our own and from a folder that others may have made.
 
 A few megabytes of zeros unpack to as many gigabytes as they claim, and NumPy makes the memory for
 an array before it reads it. Here nothing is unpacked before what it claims was compared with what

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: a vehicle may lose its power while one is written.
+"""Files that are whole or not there, also after the power was lost: written, appended to, unnamed.
 
 Nothing is written through a link that someone else left in the folder: what is written gets a new
 file under a name that nobody can foresee, which then takes the name that was meant, also from a

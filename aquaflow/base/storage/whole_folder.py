@@ -1,4 +1,4 @@
-"""Folders that are whole or not there: their files are made in a hidden folder beside them."""
+"""Folders that are whole or not there, and that one process writes to at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The topics of a dive: the same in an exported MCAP file and in a live connection."""
+"""A dive in ROS: topics, frames and message definitions, the same in a file and live."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ALIKED with LightGlue: deformable descriptors, and attention that matches them.
+"""Keypoint networks of the user's packages: ALIKED with LightGlue, and XFeat.
 
 X. Zhao and others, "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
 Transformation", IEEE TIM 2023; P. Lindenberger and others, "LightGlue: Local Feature Matching at

@@ -2,7 +2,7 @@
 
 It is the surface that ``aquaflow export --format ply`` writes (export/mesh), in the ground axes of
 the first dive: what two views at least agree on, with the sigma of where their rays meet, in the
-colours without water (export/ortho/colours.py).
+colours without water (export/ortho/drawing.py).
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def relative_colour_sigma(
 ) -> Array:
     """[N] relative 1 sigma of restored colours.
 
-    A restored colour has the posterior covariance (1 - G A) S of mapping/water/white_balance.py,
+    A restored colour has the posterior covariance (1 - G A) S of water/white_balance.py,
     whose prior has the relative deviation CONTRAST; the confidence is the mean eigenvalue of G A.
     """
     return CONTRAST * np.sqrt(1.0 - confidence)

@@ -122,7 +122,7 @@ def corner_rays(camera: CameraModel) -> Array:
 
 TEXTURE_CONTRAST = 0.6
 """Of the ground's own texture, deviation over mean: as the white balance takes it
-(mapping/water/white_balance.py)."""
+(water/white_balance.py)."""
 VISIBLE_CONTRAST = 0.05
 """Share of its contrast with which a thing is still seen: the threshold of the meteorological
 optical range (WMO-No. 8, Guide to Instruments and Methods of Observation, chapter 9). A black disc

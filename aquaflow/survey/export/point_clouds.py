@@ -1,6 +1,6 @@
-"""Point clouds as E57 files, which scanner and survey programs exchange.
+"""Point clouds as files that survey programs read: E57, which scanners write too, and LAZ.
 
-Format: ASTM E2807, written by libE57Format through pye57, whose own writer knows neither normals
+E57: ASTM E2807, written by libE57Format through pye57, whose own writer knows neither normals
 nor chunks. Normals are those of the extension E57_NOR_surface_normals; sigma is an extension of
 ours, which other readers pass over. One scan, whose translation is the origin, so that float32
 resolves 0.1 mm within a kilometre of it.

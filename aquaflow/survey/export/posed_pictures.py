@@ -1,6 +1,6 @@
-"""A COLMAP folder: a sparse model in binary, beside its pictures.
+"""Pictures with poses as training programs read them: a COLMAP folder, and nerfstudio's.
 
-Format: COLMAP's documentation, "Output Format", of the files that every version reads (cameras.bin,
+COLMAP: its documentation, "Output Format", of the files that every version reads (cameras.bin,
 images.bin, points3D.bin; little-endian). Poses are world to camera, quaternions wxyz; the camera
 looks along z with y down, and the centre of the top left pixel is (0.5, 0.5), both as here.
 """

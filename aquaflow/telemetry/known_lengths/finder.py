@@ -1,4 +1,6 @@
-"""All configured objects of known size in a dive: found once, measured with the poses of now."""
+"""All configured objects of known size in a dive: found once, measured with the poses of now.
+
+Boards are measured in board_size.py, two laser beams here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""One joint adjustment: noise estimated, outliers left out, judged by points held out of it."""
+"""One joint adjustment: noise estimated, outliers left out, judged by points held out of it.
+
+Below: its least-squares problem in blocks, and the uncertainty of what it found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each source of telemetry says about single keyframes, given the estimator's frame."""
+"""What telemetry says about single keyframes, given the estimator's frame: edges of the graph."""
 
 from __future__ import annotations
 

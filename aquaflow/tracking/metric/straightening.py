@@ -1,4 +1,4 @@
-"""The keyframe graph solved together with telemetry: frames of all sub-maps, and their worlds."""
+"""The keyframe graph solved with telemetry, learned scales and known lengths: sub-maps' worlds."""
 
 from __future__ import annotations
 

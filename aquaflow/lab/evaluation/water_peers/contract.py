@@ -1,4 +1,4 @@
-"""What every published method gets and gives."""
+"""What every published method gets and gives, and the simplest of them, grey world."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def _grow(
 # What the views say of places on the surface: colour, and how well the place is known.
 #
 # Colours are those of the ortho: the map's radiance, as restored from the range of the nearest view
-# (export/ortho/colours.py), whose bound on the amplification holds for a mesh as well.
+# (export/ortho/drawing.py), whose bound on the amplification holds for a mesh as well.
 
 BATCH = 1 << 16
 """Places worked on at a time; 20 MB."""
