@@ -1,7 +1,8 @@
 """Simulated dives with true depth and poses: TartanAir (Wang et al., IROS 2020) and MIMIR-UW.
 
 TartanAir, version 1: ``ocean/Easy/P000/{image_left/000000_left.png,
-depth_left/000000_left_depth.npy, pose_left.txt}``, 640 x 480. Version 2: ``Ocean/Data_easy/P000/{image_lcam_front/
+depth_left/000000_left_depth.npy, pose_left.txt}``, 640 x 480.
+Version 2: ``Ocean/Data_easy/P000/{image_lcam_front/
 000000_lcam_front.png, depth_lcam_front/000000_lcam_front_depth.png, pose_lcam_front.txt}``,
 640 x 640, depth as the four bytes of a float32. A field of view of 90 degrees in both; poses are
 ``tx ty tz qx qy qz qw``, camera axes x forward, y right, z down.
