@@ -41,6 +41,7 @@ class SourceReport:
     kind: str
     """As in a recording: depth, attitude, velocity, altitude, position, ..."""
     used: int = 0
+    """Samples that took part."""
     rejected: int = 0
     """Samples that contradicted the others, by chi-square."""
     reason: str = ""

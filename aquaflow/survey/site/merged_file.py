@@ -44,14 +44,17 @@ class PlacedSubMap:
     """A sub-map of a dive in its component's world."""
 
     dive: str
-    """Name."""
+    """Name of the dive."""
     number: int
+    """Of the sub-map in its dive."""
     component: int
+    """Number of the component that it lies in."""
     T_sm: Sim3
     """From the world of the sub-map's ``map.aqf``."""
     T_sn: Sim3
     """From the world of the dive's ``trajectory.tum`` and ``map.ply``."""
     keyframes: int
+    """How many it has."""
     bent: float
     """Root mean square distance by which its keyframes differ from that one similarity, in the
     component's unit: the joint optimisation bends a path that drifted."""

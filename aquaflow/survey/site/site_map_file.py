@@ -23,6 +23,7 @@ class SiteMapPart:
     """What the one map has of a dive."""
 
     name: str
+    """Of the dive."""
     fingerprint: str
     """Of the dive as it was merged."""
     T_sn: list[list[float]]
