@@ -62,7 +62,7 @@ class BatchOutcome:
     """What came of one attempt."""
 
     state: State
-    """``done``, ``poor`` (with a warning), ``failed``, ``lost`` or ``full`` (the disk)."""
+    """``done``, ``poor`` (with a warning), ``failed``, ``lost`` or ``full`` (disk)."""
     sentence: str = ""
     """Why, where the state is not ``done``."""
     frames: int | None = None

@@ -33,13 +33,13 @@ class MetricError:
     gravity_error_deg: float | None = None
     gravity_sigma_deg: float | None = None
     gravity_error_sigmas: float | None = None
-    """Angle between the two directions of z; of synthetic dives, whose z points down."""
+    """Angle between the two directions of z, of synthetic dives."""
     heading_error_deg: float | None = None
     heading_sigma_deg: float | None = None
     heading_error_sigmas: float | None = None
     """Mean turn about the vertical against the truth; only where x points to true north."""
     ate_rmse_m_level: float | None = None
-    """After alignment by yaw and translation alone: errors of gravity count, too."""
+    """After alignment by yaw and translation alone."""
 
     def to_json(self) -> dict[str, float | None]:
         """As plain values with the names above."""

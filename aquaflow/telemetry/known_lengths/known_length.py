@@ -21,9 +21,9 @@ class KnownLength:
     """Its ratio ``length_m / map_length`` is the scale of the map."""
 
     frame_index: int
-    """That it was measured in, or the nearest of several; -1: marked in the map itself."""
+    """Frame that it was measured in, or the nearest of several; -1: marked in the map itself."""
     source: str
-    """What it is, for the report: ``marker 17``, ``laser dots``, ``scale bar``."""
+    """What it is: ``marker 17``, ``laser dots``, ``scale bar``."""
     map_length: float
     map_sigma: float
     """Length in the map and its 1 sigma, map units."""
