@@ -69,7 +69,7 @@ class BatchOutcome:
     tracked: int | None = None
     """All frames, and those with a pose."""
     psnr: float | None = None
-    """Of held-out views, dB; None without a map."""
+    """Of held-out views, dB; null without a map."""
     cpu_s: float | None = None
     """CPU time of all threads."""
     peak_mb: float | None = None

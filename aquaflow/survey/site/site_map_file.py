@@ -30,9 +30,9 @@ class SiteMapPart:
     gaussians: int
     """Number of its rows in the PLY, after those of the dives before."""
     gone: int
-    """Gaussians that later dives see past."""
+    """Number of Gaussians that later dives see past."""
     replaced: int
-    """Gaussians of places that another dive shows later, or from much nearer."""
+    """Number of Gaussians of places that another dive shows later, or from much nearer."""
     gains: list[float]
     """[3] factors of the dive's colours."""
 
