@@ -84,7 +84,7 @@ check: setup markers ## Lint, formatting, unused code, links of the documentatio
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $(KERNELS) $(wildcard tests/render/native/*.cpp)
 	$(BIN)/vulture
-	$(MKDOCS) --quiet
+	$(MKDOCS)
 	$(BIN)/mypy
 
 docs: setup ## Build the documentation into out/site; a broken internal link fails.

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from aquaflow.render.views import View
 
 SETTLING_ROUNDS = 2
-"""Optimisations with telemetry at the end: the second starts from a path that the first pulled
+"""Most optimisations with telemetry at the end: the second starts from a path that the first pulled
 straight, whose metric frame is better."""
 
 
@@ -215,7 +215,7 @@ class Slam:
             self._wait_for_graph()
         if self.metric.present:
             for _ in range(SETTLING_ROUNDS):
-                if not until.over:
+                if self.metric.strained and not until.over:
                     self.graph.straighten()
                     self._wait_for_graph()
             with self.profiler.stage("metric"):

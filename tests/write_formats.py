@@ -1,10 +1,10 @@
-"""Fills the tables of docs/formats.md from the classes that are written to and read from the files.
+"""Fills lists and tables of docs/formats.md from the classes that are written to the files.
 
     python -m tests.write_formats
 
-A table stands between ``<!-- fields of MODULE.CLASS -->`` and ``<!-- end -->`` and has a row for
-each field, or each value of an enumeration, with the text that stands below it in the source; one
-of ``bands`` has a row for each file that a module of rasters describes.
+A list stands between ``<!-- fields of MODULE.CLASS -->`` and ``<!-- end -->`` and has a line for
+each field, or each value of an enumeration, with the text that stands below it in the source; a
+table of ``bands`` has a row for each file that a module of rasters describes.
 tests/test_formats.py fails where the page holds something else.
 """
 
@@ -48,17 +48,16 @@ def meanings(described: type[Any]) -> dict[str, str]:
     return found
 
 
-def table_of(described: type[Any]) -> str:
-    """A row for each text, with the names that share it."""
+def list_of(described: type[Any]) -> str:
+    """A line for each text, with the names that share it."""
     written = WRITTEN_AS.get(described, {})
-    rows: dict[str, list[str]] = {}
-    for name, text in meanings(described).items():
+    lines: dict[str, list[str]] = {}
+    for name, stated in meanings(described).items():
+        text = stated[:1].lower() + stated[1:] if stated[1:2].islower() else stated
         is_value = issubclass(described, Enum)
         shown = described[name].value if is_value else written.get(name, name)
-        rows.setdefault(text, []).append(f"`{shown}`")
-    lines = [f"| {', '.join(names)} | {text} |" for text, names in rows.items()]
-    head = "| value | meaning |" if issubclass(described, Enum) else "| name | meaning |"
-    return "\n".join([head, "|---|---|", *lines, ""])
+        lines.setdefault(text, []).append(f"`{shown}`")
+    return "\n".join([*(f"- {', '.join(names)}: {text}" for text, names in lines.items()), ""])
 
 
 def table_of_telemetry() -> str:
@@ -83,7 +82,7 @@ def table_of_bands(module: str) -> str:
 
 
 def filled(page: str) -> str:
-    """The page with its tables as the classes say today."""
+    """The page with its lists and tables as the classes say today."""
 
     def block(match: re.Match[str]) -> str:
         begin, kind, name, end = match.groups()
@@ -93,7 +92,7 @@ def filled(page: str) -> str:
         elif kind == "bands":
             table = table_of_bands(name)
         else:
-            table = table_of(getattr(importlib.import_module(module), described))
+            table = list_of(getattr(importlib.import_module(module), described))
         return f"{begin}\n{table}\n{end}"
 
     return BLOCK.sub(block, page)

@@ -32,7 +32,7 @@ class PoseRow:
     t_s: float
     """Seconds since the recording's first frame."""
     utc: datetime | None
-    """ISO 8601 with microseconds, such as ``2026-11-22T13:03:05.250000Z``."""
+    """ISO 8601 with microseconds."""
     sub_map: int
     """Number of the sub-map, as in frames.csv."""
     x: float
@@ -45,12 +45,12 @@ class PoseRow:
     longitude_deg: float | None = None
     """Of the camera's centre, WGS 84; where an origin and true north are known."""
     depth_m: float | None = None
-    """Below the surface, as the vehicle measured it; linear between samples at most 2 s apart."""
     altitude_m: float | None = None
-    """Above the bottom, as the vehicle measured it; linear between samples at most 2 s apart."""
+    """Below the surface and above the bottom, as measured; linear between samples at most 2 s
+    apart."""
     heading_deg: float | None = None
-    """From 0 to 360, clockwise from what x points to; of the body, or of the camera if its mounting
-    is unknown; only where gravity is known."""
+    """0 to 360, clockwise from what x points to; of the body, or the camera if its mounting is
+    unknown; only where gravity is known."""
     roll_deg: float | None = None
     pitch_deg: float | None = None
     """Of the body or the camera, as the heading."""

@@ -287,15 +287,19 @@ def confirmation_of(
     path: CameraPath,
     problem_along: Callable[[CameraPath], TelemetryProblem],
 ) -> Confirmation:
-    """Estimate the scale anew from every part and every kind of source.
+    """Estimate the scale anew from every part and every kind of source, unless the path is too
+    short to have parts enough.
 
     ``problem_along`` a part of the path, with what telemetry says there.
     """
+    parts = _parts(path)
+    if len(parts) < LEAST_PARTS:
+        return Confirmation(0, 0, np.inf)
     logs: list[float] = []
     variances: list[float] = []
     kinds: set[str] = set()
     shown = 0
-    for part in _parts(path):
+    for part in parts:
         before = len(logs)
         problem = problem_along(part)
         others = [factor for factor in problem.factors if factor.kind not in SCALING]

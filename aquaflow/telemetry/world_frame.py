@@ -39,12 +39,13 @@ class SourceReport:
     source: str
     """The device's name."""
     kind: str
-    """As in a recording: depth, attitude, velocity, altitude, position, ..."""
+    """As in a recording, such as ``depth``."""
     used: int = 0
+    """Samples that took part."""
     rejected: int = 0
     """Samples that contradicted the others, by chi-square."""
     reason: str = ""
-    """Why nothing of it, or not all, was used; empty where there is nothing to say."""
+    """Why nothing of it, or not all, was used; else empty."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,17 @@ class FrameClass(str, Enum):
     """What a frame is used for (paper, Sec. 3.2), or why it is not used."""
 
     KEYFRAME = "keyframe"
+    """Few matches are left with the keyframe before; joins the graph and brings Gaussians."""
     MAPPING = "mapping"
+    """Seen with enough parallax since the last mapped frame; brings Gaussians."""
     COMMON = "common"
+    """Neither; refines the Gaussians that are there."""
     SKIPPED = "skipped"
+    """Refused by the gate: dark, blurred, blinded, or nothing moved."""
     LOST = "lost"
+    """No pose was found."""
     DROPPED = "dropped"
+    """Could not be read, or a live run had no time for it."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class DiveState(str, Enum):
     FINISHING = "finishing"
     """The pilot wants it finished; a process that ends now has left that undone."""
     RESCALING = "rescaling"
-    """Its files are being brought to metres; a process that ends now leaves two units in them."""
+    """Its files are being brought to metres; if that ends now, they have two units."""
     STOPPED = "stopped"
     """The service was told to end: the deliverables are there, and the dive may go on."""
     FINISHED = "finished"
@@ -50,12 +50,11 @@ class DiveStatus:
     paused: bool = False
     """The pilot wants nothing mapped, until he asks for it."""
     begun_utc: str | None = None
-    """Of a live dive, by the computer's clock; null while that had never been set."""
+    """When a live dive began; null while the computer's clock had never been set."""
     boot: str = ""
-    """Of the kernel under which a live dive last ran, from which its monotonic clock counts; empty
-    of a replay."""
+    """Boot of the kernel under which a live dive last ran; empty of a replay."""
     mounting: dict[str, object] | None = None
-    """Of a live dive's camera in the body, as the config or the camera stated it; else null."""
+    """How a live dive's camera sits in the body, if that was stated; else null."""
 
     @property
     def is_live(self) -> bool:

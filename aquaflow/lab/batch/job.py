@@ -66,16 +66,20 @@ class BatchOutcome:
     """What came of one attempt."""
 
     state: State
+    """``done``, ``poor`` (with a warning), ``failed``, ``lost`` or ``full`` (disk)."""
     sentence: str = ""
     """Why, where the state is not ``done``."""
     frames: int | None = None
     tracked: int | None = None
+    """All frames, and those with a pose."""
     psnr: float | None = None
-    """Of held-out views, dB; None without a map."""
+    """Of held-out views, dB; null without a map."""
     cpu_s: float | None = None
+    """CPU time of all threads."""
     peak_mb: float | None = None
     """Largest resident set of the process, 1e6 bytes."""
     wall_s: float | None = None
+    """From start to end, on the machine's clock."""
     node: str = ""
     """Name of the machine."""
     earlier: bool = False

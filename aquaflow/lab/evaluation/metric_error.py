@@ -29,19 +29,21 @@ class MetricError:
     scale_error_pct: float
     """Estimated over true lengths, less 1; by the Sim(3) alignment."""
     scale_sigma_pct: float
+    """As the dive states it, 1 sigma."""
     scale_error_sigmas: float | None
-    """Error over the stated 1 sigma, as all ``_sigmas``; null for a sigma of 0."""
+    """Error over the stated 1 sigma; null for a sigma of 0."""
     ate_rmse_m: float
     """After SE(3) alignment: no scale is taken from the truth."""
     gravity_error_deg: float | None = None
     gravity_sigma_deg: float | None = None
     gravity_error_sigmas: float | None = None
+    """Angle between the two directions of z, of synthetic dives."""
     heading_error_deg: float | None = None
-    """Mean turn about the vertical against the truth; only where x points to true north."""
     heading_sigma_deg: float | None = None
     heading_error_sigmas: float | None = None
+    """Mean turn about the vertical against the truth; only where x points to true north."""
     ate_rmse_m_level: float | None = None
-    """After alignment by yaw and translation alone: errors of gravity count, too."""
+    """After alignment by yaw and translation alone."""
 
     def to_json(self) -> dict[str, float | None]:
         """As plain values with the names above."""

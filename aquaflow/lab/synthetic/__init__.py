@@ -29,13 +29,13 @@ __all__ = [
 
 _HOMES = {
     "Medium": "water",
-    "SimulatedDive": "simulation",
+    "SimulatedDive": "dive",
     "SyntheticConfig": "config",
     "Truth": "truth",
     "WATER_TYPES": "water",
     "read_telemetry": "telemetry",
     "read_truth": "truth",
-    "simulate": "simulation",
+    "simulate": "dive",
     "write_dive": "dive",
 }
 """Module of each public name, imported when it is first asked for."""

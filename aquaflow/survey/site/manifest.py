@@ -28,12 +28,11 @@ class SiteDive:
     """A dive of a site."""
 
     name: str
-    """Unique in the site: the dive folder's name, with a number where two are alike."""
+    """The dive folder's name, with a number where two are alike."""
     path: str
-    """Of the dive folder: relative to the site where it is on the same file system."""
+    """The dive folder, relative to the site on the same file system."""
     fingerprint: str
-    """SHA-256 over places.npz, metric.json, trajectory.tum and frames.csv when the dive was
-    added."""
+    """SHA-256 over places.npz, metric.json, trajectory.tum and frames.csv when added."""
 
     def folder(self, site: Path) -> Path:
         """The dive folder."""

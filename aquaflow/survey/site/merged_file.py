@@ -44,17 +44,20 @@ class PlacedSubMap:
     """A sub-map of a dive in its component's world."""
 
     dive: str
-    """Name."""
+    """Its name."""
     number: int
+    """Sub-map in its dive."""
     component: int
+    """Component that it lies in."""
     T_sm: Sim3
     """From the world of the sub-map's ``map.aqf``."""
     T_sn: Sim3
     """From the world of the dive's ``trajectory.tum`` and ``map.ply``."""
     keyframes: int
+    """Number of them."""
     bent: float
-    """Root mean square distance by which its keyframes differ from that one similarity, in the
-    component's unit: the joint optimisation bends a path that drifted."""
+    """Root mean square distance by which its keyframes differ from that one similarity: the joint
+    optimisation bends a path that drifted."""
 
 
 @dataclass(frozen=True)

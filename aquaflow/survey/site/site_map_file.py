@@ -24,17 +24,17 @@ class SiteMapPart:
 
     name: str
     fingerprint: str
-    """Of the dive as it was merged."""
+    """The dive, as it was merged."""
     T_sn: list[list[float]]
     """[4, 4], from the world of the dive's files to the map's."""
     gaussians: int
-    """In the PLY, after those of the dives before."""
+    """Number of its rows in the PLY, after those of the dives before."""
     gone: int
-    """That later dives see past."""
+    """Number of Gaussians that later dives see past."""
     replaced: int
-    """Of places that another dive shows later, or from much nearer."""
+    """Number of Gaussians of places that another dive shows later, or from much nearer."""
     gains: list[float]
-    """[3] that the dive's colours were multiplied by."""
+    """[3] factors of the dive's colours."""
 
 
 def names_of(site: Path, component: int) -> tuple[Path, Path]:

@@ -27,15 +27,17 @@ class KnownLength:
     """Its ratio ``length_m / map_length`` is the scale of the map."""
 
     frame_index: int
-    """That it was measured in, or the nearest of several; -1: marked in the map itself."""
+    """Frame that it was measured in, or the nearest of several; -1: marked in the map itself."""
     source: str
-    """What it is, for the report: ``marker 17``, ``laser dots``, ``scale bar``."""
+    """What it is: ``marker 17``, ``laser dots``, ``scale bar``."""
     map_length: float
-    """In map units."""
     map_sigma: float
+    """Length in the map and its 1 sigma, map units."""
     length_m: float
     sigma_m: float
+    """True length and its 1 sigma, metres."""
     sub_map: int = 0
+    """Number of the sub-map that it was marked in."""
 
     @property
     def metres_per_unit(self) -> float:
@@ -53,8 +55,11 @@ class LengthScale:
     """The scale of one sub-map by all its known lengths."""
 
     metres_per_unit: float
+    """Weighted mean of the lengths."""
     relative_sigma: float
+    """1 sigma of it, relative."""
     used: int
+    """Number of lengths that agree."""
     rejected: tuple[KnownLength, ...]
     """Lengths that contradict the others."""
 

@@ -77,6 +77,8 @@ class Straightened:
     result: GraphResult
     frames: dict[int, WorldFrame]
     """By component."""
+    strained: bool
+    """True if keyframes were pulled to a world; False if they are where they would be without."""
 
 
 def straighten(
@@ -105,7 +107,7 @@ def straighten(
     for component, T in T_mn.items():
         if frames[component].metric:
             frames[component] = replace(frames[component], T_nm=T.inverse())
-    return Straightened(result, frames)
+    return Straightened(result, frames, bool(worlds))
 
 
 def solve_with_worlds(

@@ -75,6 +75,9 @@ class WorldFrames:
         self._since = 0
         self._solved: dict[int, WorldFrame] = {}
         """By component; set in the thread of the last job."""
+        self.strained = True
+        """False if the last job left the keyframes where they would be without telemetry: another
+        one would, too."""
         self.base: EarlierDive | None = None
         """An earlier dive in which this one may be recognised."""
 
@@ -150,7 +153,7 @@ class WorldFrames:
         def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
                 solved = straighten(better, replace(survey, nodes=better.nodes), t_s, bases)
-                self._solved = solved.frames
+                self._solved, self.strained = solved.frames, solved.strained
                 return solved.result
             return solve(better)  # what telemetry cannot do must not cost the loops
 
