@@ -88,7 +88,7 @@ def coverage_of_dive(
     centres: npt.NDArray[np.floating],  # [N, 3] in n
     frame: WorldFrame,
 ) -> npt.NDArray[np.uint8] | None:
-    """[N] a :class:`aquaflow.survey.coverage.Seen` for each; None where the dive keeps no
+    """[N] a the coverage for each; None where the dive keeps no
     coverage."""
     if not dive.has(NAME):
         return None
