@@ -59,6 +59,9 @@ SEA_WATER = water_index()
 FRESH_WATER = water_index(salinity_psu=0.0)
 
 
+# --------------------------------------------------------------------------------------------------
+# The ports.
+
 ACRYLIC = 1.49
 """Refractive index of PMMA, of which most ports of small vehicles are."""
 REFERENCE_RANGE_M = 1.0

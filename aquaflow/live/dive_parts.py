@@ -91,6 +91,10 @@ class DeviceErrors:
 log = logging.getLogger(__name__)
 
 
+# --------------------------------------------------------------------------------------------------
+# The parts of a live dive.
+
+
 @dataclass(frozen=True)
 class Parts:
     """The parts of a live dive, for the viewer and the report."""

@@ -106,6 +106,10 @@ def _take_over(moved: Mapper, mapper: Mapper) -> None:
 
 log = logging.getLogger(__name__)
 
+
+# --------------------------------------------------------------------------------------------------
+# Work on the maps, on the device as long as it goes.
+
 P = ParamSpec("P")
 
 MOST_LEFT_OUT = 10

@@ -68,6 +68,10 @@ class FlowPrior:
         return best_flow(self._matchers.own, a, b, starts, near)
 
 
+# --------------------------------------------------------------------------------------------------
+# The classical prior.
+
+
 class ClassicalPrior(FlowPrior):
     """SIFT-homography-initialised DIS flow behind the prior contract."""
 

@@ -69,6 +69,9 @@ class DepthCard(StageConfig):
         return self
 
 
+# --------------------------------------------------------------------------------------------------
+# The folder of a prior.
+
 CARD = "prior.json"
 """Names the network, its inputs and its licence."""
 ENCODER, DECODER = "encoder.onnx", "decoder.onnx"

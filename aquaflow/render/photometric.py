@@ -32,6 +32,9 @@ class KnownGradient(torch.autograd.Function):
         return (g_scalar * gradient, *[None] * (len(ctx.needs_input_grad) - 1))
 
 
+# --------------------------------------------------------------------------------------------------
+# The loss of a picture against another.
+
 SSIM_WINDOW = 11
 SSIM_SIGMA_PX = 1.5
 SSIM_C1 = 0.01**2

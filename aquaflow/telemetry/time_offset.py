@@ -279,6 +279,10 @@ def sandwich_of(
 
 Array = npt.NDArray[np.float64]
 
+
+# --------------------------------------------------------------------------------------------------
+# The offset between a video and a log.
+
 SMOOTHING_S = 0.2
 """1 sigma of the Gaussian over which rates are compared. On 40 simulated dives of 20 and 60 s, with
 a gyro and with attitudes, 0.15 to 0.3 s give the same errors; the stated sigma is true at 0.2."""

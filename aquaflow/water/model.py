@@ -250,6 +250,11 @@ def gain_map(
 
 
 Array = npt.NDArray[np.float64]
+
+
+# --------------------------------------------------------------------------------------------------
+# The model of trial water.
+
 Index = npt.NDArray[np.int64]
 
 BELIEVED = WaterPriorsConfig()

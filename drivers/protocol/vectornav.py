@@ -138,6 +138,9 @@ def _masks(buffer: bytes, at: int) -> tuple[dict[int, int], int]:
     return dict(zip(groups, masks, strict=True)), at + 2 + 2 * len(groups)
 
 
+# --------------------------------------------------------------------------------------------------
+# The decoder.
+
 STARTUP = (Field(1, 0), Field(2, 0))
 """Nanoseconds since it was switched on."""
 QUATERNION, ANGLES = (Field(1, 4), Field(5, 2)), (Field(1, 3), Field(5, 1))

@@ -53,6 +53,10 @@ __all__ = [
     "WaterType",
 ]
 
+
+# --------------------------------------------------------------------------------------------------
+# The settings of a synthetic dive.
+
 SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey", "hull", "net"]
 Display: TypeAlias = Literal["clock", "clock_and_crosshair", "panel"]
 WaterType: TypeAlias = Literal[

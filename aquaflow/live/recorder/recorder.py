@@ -42,6 +42,10 @@ def free_bytes(folder: Path) -> int:
 
 log = logging.getLogger(__name__)
 
+
+# --------------------------------------------------------------------------------------------------
+# The recorder.
+
 MB = 1_000_000
 """Bytes of a megabyte, the unit of the settings."""
 

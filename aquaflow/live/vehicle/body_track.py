@@ -70,6 +70,10 @@ def _angles_by_rotation(
 
 Array = npt.NDArray[np.float64]
 
+
+# --------------------------------------------------------------------------------------------------
+# The body's track.
+
 Place: TypeAlias = Callable[[Sim3], BodyPoseInWorld]
 """The body's pose for a camera pose in the sub-map, as the map's place in the world is known."""
 

@@ -65,6 +65,9 @@ TINY = Mast3rSize(
 """For tests: the same code in a second."""
 
 
+# --------------------------------------------------------------------------------------------------
+# The network.
+
 MEAN = STD = 0.5
 """Of the pixel values that the checkpoint was trained on."""
 
