@@ -3,7 +3,7 @@
 The first pass tracks from the beginning until the lens is known well enough, or for as many frames
 as it may. Its poses are rough where the guess was wrong; the adjustment of the lens corrects them.
 Where they do not hang together, because the guess lost frames or broke the map into sub-maps, the
-pass is repeated with what it found.
+pass is repeated with what it found; if that does not help, with each focal length that may be.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -39,6 +39,9 @@ from aquaflow.types import Frame
 
 MOST_FRAMES = 600
 """Looked at for the lens: a minute of the dive at 10 frames/s, and a minute of two cores."""
+MOST_FRAMES_OF_A_TRY = 150
+"""The same at each focal length that may be, where the guess has failed: enough for a start, and a
+camera that stands still or sees nothing costs no three minutes."""
 GOOD_SIGMA = np.array([0.0075, 0.01])
 """Of log focal length and k1: better than calibrations in water agree with each other."""
 REPEAT_OUTSIDE_SHARE = 0.1
@@ -54,16 +57,40 @@ Progress = Callable[[int, int | None], None]
 def found_in(recording: CameraSource, config: Config, progress: Progress) -> FoundCamera | None:
     """The camera of a recording without calibration; None where its beginning shows too little."""
     first = _Pass(recording, config, progress)
-    found = first.run()
-    camera = None if found is None else usable(found.camera(first.guess))
-    if found is None or camera is None:
-        return None
-    if first.outside_share > REPEAT_OUTSIDE_SHARE:
-        again = _Pass(recording, config, progress, camera, found).run()
-        better = None if again is None else usable(again.camera(first.guess))
-        if again is not None and better is not None:
-            camera, found = better, again
-    return FoundCamera(camera, found, used=True)
+    best = first.run()
+    if best is not None and best.is_in_pieces:
+        best = _better(best, _Pass(recording, config, progress, best.camera, best.found).run())
+    if best is None or best.is_in_pieces:
+        factors = config.tracking.initialisation.focal_factors
+        for factor in sorted(factors, key=lambda factor: abs(np.log(factor))):
+            camera = replace(first.guess.with_focal_scaled(factor), calibrated=True)
+            best = _better(
+                best, _Pass(recording, config, progress, camera).run(MOST_FRAMES_OF_A_TRY)
+            )
+            if best is not None and not best.is_in_pieces:
+                break
+    return None if best is None else FoundCamera(best.camera, best.found, used=True)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a pass found, and how well its poses hang together."""
+
+    camera: CameraModel
+    found: FoundLens
+    outside_share: float
+    """Of the frames, how many have no pose in the largest sub-map."""
+
+    @property
+    def is_in_pieces(self) -> bool:
+        return self.outside_share > REPEAT_OUTSIDE_SHARE
+
+
+def _better(a: _Found | None, b: _Found | None) -> _Found | None:
+    """The one that poses more frames together; the later one where both pose as many."""
+    if a is None or b is None:
+        return a or b
+    return a if a.outside_share < b.outside_share else b
 
 
 class _Pass:
@@ -88,25 +115,28 @@ class _Pass:
         in front of it."""
         self.guess = guess_camera(1, 1)
         """Of the pictures; known with the first."""
-        self.outside_share = 0.0
-        """Of the frames, how many have no pose in the largest sub-map."""
+        self._outside_share = 0.0
 
-    def run(self) -> FoundLens | None:
-        """The lens as far as it was found."""
+    def run(self, most_frames: int = MOST_FRAMES) -> _Found | None:
+        """The lens as far as it was found, and can be used."""
         slam = Slam(self._config)
         try:
-            return self._run(slam)
+            found = self._run(slam, most_frames)
         finally:
             slam.close()
+        camera = None if found is None else usable(found.camera(self.guess))
+        if found is None or camera is None:
+            return None
+        return _Found(camera, found, self._outside_share)
 
-    def _run(self, slam: Slam) -> FoundLens | None:
+    def _run(self, slam: Slam, most_frames: int) -> FoundLens | None:
         plain = Preparation(self._config.source, None)
         rectified = (
             plain if self._camera is None else Preparation(self._config.source, self._camera)
         )
         views: LensViews | None = None
         surest: FoundLens | None = None
-        for frame in self._frames():
+        for frame in self._frames(most_frames):
             try:
                 seen = plain(frame)
                 tracked = seen if rectified is plain else rectified(frame)
@@ -127,11 +157,11 @@ class _Pass:
         self._take(slam, views, slam.finish_tracking())
         return _surer(surest, self._estimate(slam, views))
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self, most: int) -> Iterator[Frame]:
         """Until the recording ends or fails, which the mapping then meets again and counts."""
         source = self._config.source
         events = self._recording.frames(source.every, source.start, source.stop)
-        for done in range(1, MOST_FRAMES + 1):
+        for done in range(1, most + 1):
             event = None
             with Failures(strict=False).contain("reading"):
                 event = next(events, None)
@@ -160,7 +190,7 @@ class _Pass:
         results = slam.results()
         poses: dict[int, Sim3] = {t.frame.index: t.T_wc for t in results if t.T_wc is not None}
         posed_in = Counter(t.sub_map for t in results if t.T_wc is not None)
-        self.outside_share = 1.0 - max(posed_in.values(), default=0) / max(len(results), 1)
+        self._outside_share = 1.0 - max(posed_in.values(), default=0) / max(len(results), 1)
         # The first views were taken before the overlay was found.
         shown = [view.where(self._overlays.shown) for view in views.posed_views(poses)]
         return found_lens(shown, self._lens_of(slam.tracker.camera))

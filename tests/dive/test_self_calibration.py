@@ -112,7 +112,8 @@ def test_a_recording_that_cannot_be_read_to_its_end_is_used_until_there(
     found_in(
         Failing(open_recording(small_recording / "images")), TRACKING, lambda k, _: seen.append(k)
     )
-    assert seen == [1, 2]
+    assert seen[:2] == [1, 2]
+    assert max(seen) == 2  # also where other focal lengths are tried
 
 
 def passes(monkeypatch: pytest.MonkeyPatch, *ends: tuple[FoundLens | None, float]) -> list[Any]:
@@ -125,10 +126,13 @@ def passes(monkeypatch: pytest.MonkeyPatch, *ends: tuple[FoundLens | None, float
 
         def __init__(self, *given: Any) -> None:
             began.append(given[3] if len(given) > 3 else None)
-            self._lens, self.outside_share = ends[len(began) - 1]
+            self._lens, self._outside_share = ends[len(began) - 1]
 
-        def run(self) -> FoundLens | None:
-            return self._lens
+        def run(self, most_frames: int = 0) -> calibration_pass._Found | None:
+            of_lens = self._lens
+            if of_lens is None:
+                return None
+            return calibration_pass._Found(of_lens.camera(GUESS), of_lens, self._outside_share)
 
     monkeypatch.setattr(calibration_pass, "_Pass", Pass)
     return began
@@ -144,6 +148,36 @@ def test_where_the_guess_broke_the_map_tracking_is_repeated_with_what_was_found(
     assert began[1].fx == pytest.approx(GUESS.fx * np.exp(0.2))
     assert len(began) == 2
     assert camera.camera.fx == pytest.approx(GUESS.fx * np.exp(0.25))
+
+
+@pytest.mark.parametrize("first", [(None, 1.0), (lens(0.2, 0.02), 0.5)], ids=["none", "pieces"])
+def test_where_the_guess_failed_each_focal_length_that_may_be_is_tried(
+    small_recording: Path, monkeypatch: pytest.MonkeyPatch, first: tuple[FoundLens | None, float]
+) -> None:
+    repeated = [] if first[0] is None else [(lens(0.2, 0.02), 0.5)]
+    ends = [first, *repeated, (lens(-0.3, 0.01), 0.3), (None, 1.0), (lens(0.25, 0.01), 0.0)]
+    began = passes(monkeypatch, *ends)
+    camera = found_in(open_recording(small_recording / "images"), TRACKING, lambda *_: None)
+    assert camera is not None
+    assert camera.camera.fx == pytest.approx(GUESS.fx * np.exp(0.25))
+    tried = began[1 + len(repeated) :]
+    assert [each.fx / GUESS.fx for each in tried] == pytest.approx([1.0, 1.4, 0.7])
+    assert all(each.calibrated for each in tried)
+
+
+@pytest.mark.ci
+def test_a_survey_that_shows_its_focal_length_late_is_placed_without_calibration(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    recording = tmp_path / "survey"
+    recording.mkdir()
+    for picture in (shared_data / "auv_survey_6").glob("*.tif"):
+        (recording / picture.name).symlink_to(picture)
+    replay.map_recording(open_recording(recording), "survey 6", tmp_path / "dive", TRACKING)
+    numbers = json.loads((tmp_path / "dive" / "metrics.json").read_text())
+    assert numbers["tracked"] == numbers["frames"] == 8
+    stated = numbers["self_calibration"]
+    assert abs(stated["focal_px"] - 1442.4 * 480 / 1360) < 3.0 * stated["focal_sigma_px"]
 
 
 def test_a_map_in_one_piece_is_not_repeated(
