@@ -177,8 +177,9 @@ def map_command(
             map_realtime(source, settings, calibration, out, overwrite, as_json, in_site), as_json
         )
         return
-    recording = open_recording(source, settings.source.fps, topic)
-    given = open_telemetry(source, telemetry or (), telemetry_offset)
+    fps, logs = settings.source.fps, telemetry or ()
+    recording = open_recording(source, fps, topic)
+    given = open_telemetry(source, logs, telemetry_offset, fps, topic)
 
     from aquaflow.dive.replay import (
         map_recording,  # loads torch: after what can be refused without it

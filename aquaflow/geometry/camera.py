@@ -24,7 +24,7 @@ from pydantic import (
 
 from aquaflow.base.errors import ConfigError, path_of_key, words_of
 from aquaflow.base.errors.plain_yaml import read_mapping
-from aquaflow.geometry.foreign_calibration import FISHEYE, values_of_file, values_of_yaml
+from aquaflow.geometry.foreign_calibration import MODELS, values_of_file, values_of_yaml
 from aquaflow.geometry.port import Port
 from aquaflow.geometry.port_file import DomePortFile, FlatPortFile, PortFile, as_stated, port_of
 
@@ -218,8 +218,8 @@ def load_camera(path: Path, inside: bool = False) -> CameraModel:
     if data is None:
         data = read_mapping(path, "calibration", "compare it with docs/formats.md", inside)
         data = values_of_yaml(path, data) or data
-    if data.get("distortion_model") in FISHEYE:
-        data["distortion_model"] = "fisheye"
+    if (model := MODELS.get(str(data.get("distortion_model")).lower())) is not None:
+        data["distortion_model"] = model
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:
