@@ -103,7 +103,7 @@ class McapCamera:
         """As every frame carried it, be it only a guess."""
         known = self._stated is not None and self._stated.calibrated
         self.camera: CameraModel | None = self._stated if known else None
-        self.frame_count: int | None = self._count(self._messages.counts())
+        self.frame_count: int | None = self._count(self._messages.counts)
         if others := self._other_topics():
             also = f"also there: {', '.join(others)} (choose by --topic)"
             self._facts["topic"] = f"{self.topic} is used; {also}"
@@ -178,14 +178,14 @@ class McapCamera:
     def _choose_topic(self) -> str | None:
         """The picture topic that suits best, where there are several and none is ours."""
         heads = []
-        for each in self._messages.heads():
+        for each in self._messages.heads:
             if OURS in self._messages.facts:
                 return None
             heads.append(each)
         found = [each.topic for each in heads if picture_kind(each) is not None]
         if len(found) < 2:
             return None
-        counts = self._messages.counts() or Counter(each.topic for each in heads)
+        counts = self._messages.counts or Counter(each.topic for each in heads)
         return choose_topic((topic, counts.get(topic, 0)) for topic in found)
 
     def _first_picture(self, camera: str | None, topic: str | None) -> tuple[McapMessage, int]:
@@ -209,7 +209,7 @@ class McapCamera:
                 return message, missing.get(base, taken_ns)
         which = "" if camera is None else f" of camera '{camera}'"
         which += "" if topic is None else f" on {topic}"
-        known = ", ".join(sorted(message.topic for message in self._messages.heads())) or "none"
+        known = ", ".join(sorted(message.topic for message in self._messages.heads)) or "none"
         raise InputError(
             f"{self.path} holds no picture{which}; give a recording with a camera; its topics are: "
             f"{known}"
@@ -235,7 +235,7 @@ class McapCamera:
     def _camera_info(self) -> CameraModel | None:
         """Of the CameraInfo of ROS that belongs to the topic."""
         found: dict[str, McapMessage] = {}
-        for message in self._messages.heads():
+        for message in self._messages.heads:
             name = "" if message.schema is None else message.schema.name.replace("/msg/", "/")
             if name == "sensor_msgs/CameraInfo":
                 found.setdefault(message.topic, message)
@@ -316,7 +316,7 @@ class McapCamera:
                 yield self._stored(self._payloads.decode(message))[0]
 
     def _other_topics(self) -> list[str]:
-        heads = (each for each in self._messages.heads() if picture_kind(each) is not None)
+        heads = (each for each in self._messages.heads if picture_kind(each) is not None)
         masks = f"{self._base}/mask"
         return sorted({each.topic for each in heads} - {self.topic, masks})
 

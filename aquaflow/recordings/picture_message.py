@@ -89,7 +89,7 @@ def _as_stored(
     picture: npt.NDArray[np.uint8 | np.uint16],  # [H, W] or [H, W, 3]
 ) -> Stored:
     if picture.dtype == np.uint8:
-        return to_rgb(picture.astype(np.uint8), 1)
+        return to_rgb(picture.astype(np.uint8, copy=False), 1)
     return picture.astype(np.int32)
 
 
