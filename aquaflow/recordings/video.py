@@ -24,6 +24,8 @@ EXTENSIONS = frozenset({
 })  # fmt: skip
 """Of files in containers that FFmpeg reads and cameras write."""
 
+BARE = frozenset({".h264", ".264", ".h265", ".hevc", ".mjpeg", ".mjpg"})
+"""Of streams without a container: they hold no times, and FFmpeg takes 25 a second for them."""
 COUNT_TOLERANCE = 1
 """Some containers give a duration instead of a count; one frame less is not a cut-off video."""
 CHAPTERS = (
@@ -65,8 +67,10 @@ class VideoFile:
             rate, pixel, first = decoder.rate, decoder.pixel_width, decoder.frame_count
         counts = [first, *(_frame_count(file) for file in self.files[1:])]
         self.frame_count: int | None = sum(counts) if all(counts) else None
-        self._note_rate(rate, fps)
+        self._is_bare = path.suffix.lower() in BARE
+        self._timed_by_fps = self._is_bare and fps is not None
         known = rate if rate > 0.0 else DEFAULT_FPS
+        self._note_rate(rate, known, fps)
         self._period_ns = NS_PER_S / (known if fps is None else fps)
         self.camera = self._sidecar_calibration(pixel)
         if unread := [SENSORS[each] for each in _formats(path) if each in SENSORS]:
@@ -111,6 +115,8 @@ class VideoFile:
                     if not decoder.grab():
                         break
                     position_ms = decoder.position_ms
+                    if self._timed_by_fps:
+                        position_ms = 1e-6 * self._period_ns * index
                     t_ns = clock.tick(begins_ms + position_ms)
                     if is_asked(index, every, start):
                         frame = self._frame(decoder, index, t_ns)
@@ -148,8 +154,13 @@ class VideoFile:
         camera = self.camera or guess_camera(self.width, self.height)
         return Frame(index, t_ns, t_ns, np.asarray(image, np.uint8), camera)
 
-    def _note_rate(self, rate: float, fps: float | None) -> None:
-        if rate > 0.0:
+    def _note_rate(self, rate: float, known: float, fps: float | None) -> None:
+        if self._is_bare and fps is None:
+            note = (
+                f"rate: {known:.6g} pictures a second is assumed, because the stream has no times; "
+                "give --fps"
+            )
+        elif rate > 0.0 and not self._is_bare:
             unused = "" if fps is None else "; --fps is not used"
             note = f"rate: {rate:.6g} pictures a second, from the container{unused}"
         elif fps is not None:

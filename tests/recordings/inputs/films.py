@@ -241,10 +241,28 @@ def _colon(dive: Dive, folder: Path) -> Made:
     return read_as(dive, plain.rename(folder / "10:30:00.mkv"))
 
 
-@row("film raw .h264 with --fps", needs="ffmpeg")
-def _raw_h264(dive: Dive, folder: Path) -> Made:
+@row("film bare .h264", needs="ffmpeg", says="25 pictures a second is assumed")
+def _bare_h264(dive: Dive, folder: Path) -> Made:
     path = film(folder / "a.h264", dive.pictures, "libx264", *H264, "-bf", "0")
+    return read_as(dive, path, times_s=[index / 25.0 for index in range(len(dive.pictures))])
+
+
+@row("film bare .mjpeg", needs="ffmpeg", says="25 pictures a second is assumed")
+def _bare_mjpeg(dive: Dive, folder: Path) -> Made:
+    path = film(folder / "a.mjpeg", dive.pictures, "mjpeg", "-pix_fmt", "yuvj420p")
+    return read_as(dive, path, times_s=[index / 25.0 for index in range(len(dive.pictures))])
+
+
+@row("film bare .mjpeg with --fps", needs="ffmpeg", says="10 pictures a second, from --fps")
+def _bare_mjpeg_fps(dive: Dive, folder: Path) -> Made:
+    path = film(folder / "a.mjpeg", dive.pictures, "mjpeg", "-pix_fmt", "yuvj420p")
     return read_as(dive, path, fps=RATE_HZ)
+
+
+@row("film with --fps that its container contradicts", needs="ffmpeg", says="--fps is not used")
+def _fps_and_container(dive: Dive, folder: Path) -> Made:
+    path = film(folder / "a.mp4", dive.pictures, "libx264", *H264)
+    return read_as(dive, path, fps=5.0)
 
 
 @row("film that begins late in its container", needs="ffmpeg")
