@@ -6,6 +6,7 @@ import io
 import re
 from collections import deque
 from collections.abc import Iterator
+from contextlib import ExitStack
 from itertools import chain
 from typing import Any, Generic, TypeVar
 
@@ -83,26 +84,25 @@ def decode_units(
         return
     stream = AccessUnits(chain([first], units))
     source: Any = stream  # OpenCV's stubs know only its own class of streams
-    software = [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE]
+    # One thread: several decode ahead, so that a complaint belongs to no certain picture.
+    options = [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE, cv2.CAP_PROP_N_THREADS, 1]
     try:
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, software)
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
     except (TypeError, cv2.error) as error:
         raise InputError("decoding recorded video needs opencv-python-headless 5") from error
-    try:
-        with DecoderLog() as decoder:
-            damaged = False
-            while True:
-                decoded, bgr = capture.read()
-                if not decoded or not stream.read_but_not_decoded:
-                    break
-                label, key = stream.read_but_not_decoded.popleft()
-                damaged = bool(decoder.complaints()) or (damaged and not key)
-                if damaged:
-                    yield label, None
-                    continue
+    damaged = False
+    with DecoderLog() as decoder, ExitStack() as stack:
+        stack.callback(capture.release)
+        while True:
+            decoded, bgr = capture.read()
+            if not decoded or not stream.read_but_not_decoded:
+                break
+            label, key = stream.read_but_not_decoded.popleft()
+            damaged = bool(decoder.complaints()) or (damaged and not key)
+            if damaged:
+                yield label, None
+            else:
                 yield label, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    finally:
-        capture.release()
     yield from ((label, None) for label, _ in stream.read_but_not_decoded)
 
 

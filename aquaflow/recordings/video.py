@@ -155,21 +155,14 @@ class VideoFile:
         return Frame(index, t_ns, t_ns, np.asarray(image, np.uint8), camera)
 
     def _note_rate(self, rate: float, known: float, fps: float | None) -> None:
-        if self._is_bare and fps is None:
-            note = (
-                f"rate: {known:.6g} pictures a second is assumed, because the stream has no times; "
-                "give --fps"
-            )
-        elif rate > 0.0 and not self._is_bare:
+        if rate > 0.0 and not self._is_bare:
             unused = "" if fps is None else "; --fps is not used"
             note = f"rate: {rate:.6g} pictures a second, from the container{unused}"
         elif fps is not None:
             note = f"rate: {fps:g} pictures a second, from --fps"
         else:
-            note = (
-                f"rate: {DEFAULT_FPS:g} pictures a second was assumed, because the container "
-                "states none; give --fps"
-            )
+            why = "there is no container" if self._is_bare else "the container states none"
+            note = f"rate: {known:.6g} pictures a second was assumed, because {why}; give --fps"
         self._facts["times"] = note
         if len(self.files) > 1:
             names = ", ".join(file.name for file in self.files)

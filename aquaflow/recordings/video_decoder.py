@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -17,9 +16,6 @@ from typing_extensions import Self
 from aquaflow.base.errors import InputError, printable
 from aquaflow.recordings.decoder_log import DecoderLog
 from aquaflow.recordings.picture import UnreadablePictureError
-
-# OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 REFUSED = "Cannot convert interlaced to progressive"
 """FFmpeg's scaler to OpenCV, which then returns the picture before as this one."""

@@ -241,13 +241,13 @@ def _colon(dive: Dive, folder: Path) -> Made:
     return read_as(dive, plain.rename(folder / "10:30:00.mkv"))
 
 
-@row("film bare .h264", needs="ffmpeg", says="25 pictures a second is assumed")
+@row("film bare .h264", needs="ffmpeg", says="25 pictures a second was assumed")
 def _bare_h264(dive: Dive, folder: Path) -> Made:
     path = film(folder / "a.h264", dive.pictures, "libx264", *H264, "-bf", "0")
     return read_as(dive, path, times_s=[index / 25.0 for index in range(len(dive.pictures))])
 
 
-@row("film bare .mjpeg", needs="ffmpeg", says="25 pictures a second is assumed")
+@row("film bare .mjpeg", needs="ffmpeg", says="25 pictures a second was assumed")
 def _bare_mjpeg(dive: Dive, folder: Path) -> Made:
     path = film(folder / "a.mjpeg", dive.pictures, "mjpeg", "-pix_fmt", "yuvj420p")
     return read_as(dive, path, times_s=[index / 25.0 for index in range(len(dive.pictures))])
