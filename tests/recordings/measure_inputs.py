@@ -33,8 +33,10 @@ def main(recording: Path, words: str) -> None:
         for row in all_rows():
             if words in row.name:
                 with TemporaryDirectory() as folder:
+                    place = Path(folder) / "recording"
+                    place.mkdir()
                     try:
-                        print(_line(judge, row, Path(folder)), flush=True)
+                        print(_line(judge, row, place), flush=True)
                     except Exception as error:  # the others are still wanted
                         print(f"| {row.name} | FAILED: {type(error).__name__} {error} | | | |")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,8 +46,7 @@ def decode(path: Path, width: int, height: int, filters: str = "null") -> list[P
     """What the program FFmpeg makes of a film."""
     data = run_ffmpeg(
         *("-i", f"file:{path}", "-map", "0:v:0", "-vf", f"{filters},scale={width}:{height}"),
-        *("-fps_mode", "passthrough", "-enc_time_base", "-1"),
-        *("-pix_fmt", "rgb24", "-f", "rawvideo", "-"),
+        *("-fps_mode", "passthrough", "-pix_fmt", "rgb24", "-f", "rawvideo", "-"),
     )
     return list(np.frombuffer(data, np.uint8).reshape(-1, height, width, 3))
 
@@ -126,7 +126,7 @@ def _bottom_first(dive: Dive, folder: Path) -> Made:
 
 @row("film interlaced MPEG-2 .mpg", needs="ffmpeg", says="is interlaced from frame 0", near=4.0)
 def _interlaced_mpeg2(dive: Dive, folder: Path) -> Made:
-    flags = ("-flags", "+ildct+ilme", "-top", "1")
+    flags = ("-flags", "+ildct+ilme", "-vf", "setfield=tff")
     path = film(folder / "a.mpg", dive.pictures, "mpeg2video", *flags, rate=25.0)
     return read_as(dive, path, times_s=[index / 25.0 for index in range(len(dive.pictures))])
 
@@ -195,12 +195,20 @@ def _wide_pixels_mpeg2(dive: Dive, folder: Path) -> Made:
     return read_as(dive, path, times_s=[index / 25.0 for index in range(len(dive.pictures))])
 
 
+ONE = 1 << 16
+"""Of fixed-point numbers in MP4."""
+
+
 @row("film turned by 180 degrees .mp4", needs="ffmpeg")
 def _turned(dive: Dive, folder: Path) -> Made:
     upside_down = [np.ascontiguousarray(each[::-1, ::-1]) for each in dive.pictures]
-    stored = film(folder / "stored.mp4", upside_down, "libx264", *H264)
-    path = folder / "a.mp4"
-    run_ffmpeg("-i", stored, "-c", "copy", "-metadata:s:v:0", "rotate=180", path)
+    path = film(folder / "a.mp4", upside_down, "libx264", *H264)
+    height, width = dive.pictures[0].shape[:2]
+    turn = struct.pack(">9i", -ONE, 0, 0, 0, -ONE, 0, width * ONE, height * ONE, 1 << 30)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44  # the matrix (ISO 14496-12, 8.3.2)
+    data[at : at + len(turn)] = turn
+    path.write_bytes(data)
     return read_as(dive, path)
 
 
