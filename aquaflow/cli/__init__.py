@@ -158,8 +158,10 @@ def map_command(
         "command line",
     )
     from aquaflow.base.errors import InputError
+    from aquaflow.base.errors.failures import Failures
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
+    from aquaflow.sources.picture_check import blank_at_first
     from aquaflow.sources.telemetry_input import open_telemetry
 
     calibration = None if calib is None else load_camera(calib)
@@ -186,6 +188,9 @@ def map_command(
     )
     from aquaflow.tracking.base.opening import base_of
 
+    with Failures().contain("looking at the first pictures"):
+        for clause in blank_at_first(recording, settings.source):
+            typer.echo(f"Note: before mapping: {clause}.", err=True)
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
             recording, source.name, out, settings, calibration, overwrite, progress, profile,

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config import SourceConfig
+from aquaflow.sources import CameraSource
+from aquaflow.types import Frame
+
 Grey: TypeAlias = npt.NDArray[np.float32]
 """[H, W] green of every few pixels."""
 GREEN = 1
 """Channel that water lets through."""
+FIRST = 10
+"""Pictures that are looked at before a recording is mapped: 0.1 s of a film's decoding."""
 STEP = 8
 """Every 8th pixel of every 8th row is looked at."""
 FLAT = 1.0
@@ -41,11 +48,9 @@ class PictureCheck:
     def add(
         self,
         picture: npt.NDArray[np.uint8],  # [H, W, 3]
-        step: int = STEP,
     ) -> None:
-        """The next picture, of which every ``step``-th pixel is looked at; one of another size than
-        the first is not."""
-        grey = picture[::step, ::step, GREEN].astype(np.float32)
+        """The next picture; one of another size than the first is not looked at."""
+        grey = picture[::STEP, ::STEP, GREEN].astype(np.float32)
         if self._first is None or self._last is None:
             self._first = self._last = grey
         if grey.shape != self._first.shape:
@@ -62,19 +67,22 @@ class PictureCheck:
             self._moved = max(self._moved, float(np.abs(grey - self._first).mean()))
         self._last, self._whole = grey, picture
 
-    def oddities(self) -> list[str]:
-        """Clauses on the pictures so far; none for usual ones."""
-        count, most = self._count, MOST_SHARE * self._count
-        said = [
-            f"{number} of {count} pictures are {words}"
+    def blank(self) -> list[str]:
+        """Clauses on pictures without a scene."""
+        return [
+            f"{number} of {self._count} pictures are {words}"
             for number, words in (
                 (self._dark, "nearly black"),
                 (self._bright, "nearly white"),
                 (self._flat, "of one colour"),
             )
-            if number > most
+            if number > MOST_SHARE * self._count
         ]
-        if self._flat > most or count < 2:
+
+    def oddities(self) -> list[str]:
+        """Clauses on the pictures so far; none for usual ones."""
+        count, said = self._count, self.blank()
+        if self._flat > MOST_SHARE * count or count < 2:
             return said
         if self._moved < STILL:
             said.append("nothing moves: all pictures show the same")
@@ -83,6 +91,17 @@ class PictureCheck:
         if 0 < self._cuts <= MOST_SHARE * (count - 1):  # stills of a survey are all unlike
             said.append(f"the scene changes from one picture to the next {self._cuts} times")
         return said
+
+
+def blank_at_first(camera: CameraSource, source: SourceConfig) -> list[str]:
+    """Clauses on the first pictures that would be mapped, if they show no scene: whether anything
+    moves is too early to say."""
+    check = PictureCheck()
+    frames = camera.frames(source.every, source.start, source.stop)
+    for frame in islice(frames, FIRST):
+        if isinstance(frame, Frame):
+            check.add(frame.image)
+    return check.blank()
 
 
 def oddities(

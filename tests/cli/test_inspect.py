@@ -160,3 +160,15 @@ def test_a_stream_of_sensors_that_is_not_read_is_named(
     assert (
         "sensors from  what the sensors measured is not read: GoPro" in command("inspect", path).out
     )
+
+
+def test_blank_pictures_are_named_before_they_are_mapped(
+    command: Cli, dive: Dive, tmp_path: Path, contained: None
+) -> None:
+    black = replace(dive, pictures=[np.full_like(picture, 3) for picture in dive.pictures])
+    folder = write_plainly(tmp_path / "plain", made(black, tmp_path), dive.camera)
+    ran = command("map", folder, "--out", tmp_path / "dive", "--tracking-only")
+    assert ran.code != 0
+    lines = ran.err.splitlines()
+    assert lines[0] == "Note: before mapping: 10 of 10 pictures are nearly black."
+    assert "none of 14 frames could be placed: 14 of 14 pictures are nearly black" in lines[-1]
