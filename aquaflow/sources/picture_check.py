@@ -40,7 +40,7 @@ class PictureCheck:
         self._count = self._dark = self._bright = self._flat = self._repeated = self._cuts = 0
         self._first: Grey | None = None
         self._last: Grey | None = None
-        self._whole: npt.NDArray[np.uint8] | None = None
+        self._whole = np.empty((0, 0, 3), np.uint8)
         """The last picture, for the few that equal it where it is looked at."""
         self._moved = 0.0
         """Mean difference to the first picture, the largest."""
@@ -61,7 +61,7 @@ class PictureCheck:
         self._bright += mean > BRIGHT
         self._flat += float(grey.std()) < FLAT
         if self._count > 1:
-            same = np.array_equal(grey, self._last) and self._whole is not None
+            same = np.array_equal(grey, self._last)
             self._repeated += same and np.array_equal(picture, self._whole)
             self._cuts += _correlation(self._last, grey) < CUT
             self._moved = max(self._moved, float(np.abs(grey - self._first).mean()))
