@@ -30,6 +30,7 @@ def map_recording(
     telemetry: Sequence[str | os.PathLike[str]] = (),
     telemetry_offset_s: float | None = None,
     in_site: str | os.PathLike[str] | None = None,
+    topic: str | None = None,
 ) -> Dive:
     """Map a recording into the dive folder ``out`` and read what came of it.
 
@@ -52,6 +53,7 @@ def map_recording(
         telemetry_offset_s: when these logs begin, s after the first picture; None: it is found
             from the rotations that the logs and the poses have in common.
         in_site: an earlier dive, in whose frame this one goes on once it is recognised there.
+        topic: of pictures in a bag or MCAP recording; else the one that suits best.
 
     Raises:
         InputError: the recording cannot be read or the folder cannot be written.
@@ -64,11 +66,14 @@ def map_recording(
     if camera is not None and not isinstance(camera, CameraModel):
         camera = load_camera(Path(camera))
     if isinstance(source, (str, os.PathLike)):
-        recording, name = open_recording(Path(source), fps=chosen.source.fps), Path(source).name
+        recording = open_recording(Path(source), chosen.source.fps, topic)
+        name = Path(source).name
     else:
         recording, name = source, type(source).__name__
     path = Path(source) if isinstance(source, (str, os.PathLike)) else None
-    given = open_telemetry(path, [Path(log) for log in telemetry], telemetry_offset_s)
+    given = open_telemetry(
+        path, [Path(log) for log in telemetry], telemetry_offset_s, chosen.source.fps, topic
+    )
     from aquaflow.tracking.base import base_of
 
     base = None if in_site is None else base_of(Path(in_site))

@@ -157,8 +157,10 @@ def map_command(
         "command line",
     )
     from aquaflow.base.errors import InputError
+    from aquaflow.base.errors.failures import Failures
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
+    from aquaflow.sources.picture_check import blank_at_first
     from aquaflow.sources.telemetry_input import open_telemetry
 
     calibration = None if calib is None else load_camera(calib)
@@ -176,14 +178,18 @@ def map_command(
             map_realtime(source, settings, calibration, out, overwrite, as_json, in_site), as_json
         )
         return
-    recording = open_recording(source, settings.source.fps, topic)
-    given = open_telemetry(source, telemetry or (), telemetry_offset)
+    fps, logs = settings.source.fps, telemetry or ()
+    recording = open_recording(source, fps, topic)
+    given = open_telemetry(source, logs, telemetry_offset, fps, topic)
 
     from aquaflow.dive.replay import (
         map_recording,  # loads torch: after what can be refused without it
     )
     from aquaflow.tracking.base import base_of
 
+    with Failures().contain("looking at the first pictures"):
+        for clause in blank_at_first(recording, settings.source):
+            typer.echo(f"Note: before mapping: {clause}.", err=True)
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
             recording, source.name, out, settings, calibration, overwrite, progress, profile,

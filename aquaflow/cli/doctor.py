@@ -16,6 +16,7 @@ from aquaflow.cli.console import GroupWithDefault, Json, table_console
 if TYPE_CHECKING:
     from aquaflow.sources import RecordedCamera
     from aquaflow.sources.discovery import DiscoveryResult
+    from aquaflow.sources.telemetry_input import TelemetryInput
     from aquaflow.types import Frame
 
 
@@ -148,6 +149,7 @@ def inspect(
 ) -> None:
     """Say what would be read of a recording, what would be assumed, and what is odd."""
     from aquaflow.sources import camera_reader, open_recording, telemetry_reader
+    from aquaflow.sources.telemetry_input import open_telemetry
 
     found: dict[str, Any] = {"source": str(source)}
     reader = telemetry_reader(source)
@@ -158,16 +160,18 @@ def inspect(
         finally:
             recording.close()
     if reader is not None:
-        found["telemetry"] = _telemetry(reader, source)
+        found["telemetry"] = _telemetry(open_telemetry(source, fps=fps, topic=topic))
     if as_json:
         typer.echo(json.dumps(found))
         return
+    found |= {f"{name} from": said for name, said in found.pop("sources", {}).items()}
     for name, value in found.items():
         for each in value if isinstance(value, list) else [value]:
-            typer.echo(printable(f"{name:>12}  {_in_words(each)}"))
+            typer.echo(printable(f"{name:>16}  {_in_words(each)}"))
 
 
 def _pictures(recording: RecordedCamera) -> dict[str, Any]:
+    from aquaflow.sources import sources_of
     from aquaflow.sources.picture_check import oddities
     from aquaflow.types import Frame
 
@@ -180,7 +184,7 @@ def _pictures(recording: RecordedCamera) -> dict[str, Any]:
         found["size"] = f"{width} x {height}"
         span_s = 1e-9 * (frames[-1].t_ns - frames[0].t_ns)
         if span_s > 0.0:
-            found["rate_hz"] = round((len(frames) - 1) / span_s, 3)
+            found["rate_hz"] = round((frames[-1].index - frames[0].index) / span_s, 3)
         camera = recording.camera
         found["calibration"] = (
             "none: a focal length is assumed and refined"
@@ -188,25 +192,32 @@ def _pictures(recording: RecordedCamera) -> dict[str, Any]:
             else f"fx {camera.fx:.1f} px of {camera.width}, {camera.distortion_model}"
         )
         odd += oddities([frame.image for frame in frames])
-    found["notes"] = list(recording.notes)
+    sources = sources_of(recording)
+    found["sources"] = sources
+    found["notes"] = [note for note in recording.notes if note not in sources.values()]
     found["odd"] = odd
     return found
 
 
-def _telemetry(reader: Any, source: Path) -> list[dict[str, Any]]:
-    opened = reader.open(source)
+def _telemetry(opened: TelemetryInput) -> list[dict[str, Any]]:
     kinds: dict[str, list[int]] = {}
+    read = 0
     try:
-        for sample in islice(opened.samples(), MOST_SAMPLES):
+        for sample in islice(opened.synchronised[0].samples(), MOST_SAMPLES):
             kinds.setdefault(type(sample).__name__, []).append(sample.t_ns)
+            read += 1
     except InputError as error:
-        return [{"kind": "none", "problem": str(error)}]
+        return [{"problem": str(error)}]
     finally:
         opened.close()
+    whole = read < MOST_SAMPLES
     return [
-        {"kind": kind, "read": len(times), "from_s": min(times) * 1e-9, "to_s": max(times) * 1e-9}
+        {
+            "kind": kind, "read": len(times), "from_s": min(times) * 1e-9,
+            "to_s": max(times) * 1e-9, "whole": whole,
+        }
         for kind, times in sorted(kinds.items())
-    ]
+    ] or [{"problem": "nothing that is known"}]  # fmt: skip
 
 
 def _in_words(value: Any) -> str:
@@ -214,7 +225,6 @@ def _in_words(value: Any) -> str:
         return str(value)
     if "problem" in value:
         return str(value["problem"])
-    return (
-        f"{value['kind']}: {value['read']} read, {value['from_s']:.2f} to {value['to_s']:.2f} s "
-        "after the first picture"
-    )
+    more = "" if value["whole"] else ", and more"
+    span = f"{value['from_s']:.2f} to {value['to_s']:.2f} s"
+    return f"{value['kind']}: {value['read']}{more}, at {span} after the beginning"

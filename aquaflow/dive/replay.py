@@ -18,7 +18,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.recordings.playback import Event, Playback
 from aquaflow.slam import Slam
-from aquaflow.sources import RecordedCamera, mounting_of
+from aquaflow.sources import RecordedCamera, mounting_of, sources_of
 from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
 from aquaflow.telemetry.start import camera_in_body
@@ -132,8 +132,20 @@ def _replay(
             f"{run.name}: none{known} lies between --start {source.start} and {end}"
         )
     synchronise(run, telemetry)
+    run.sources = _sources(run, recording)
     notes = recording.notes + telemetry.notes
     return run.finish(notes, lambda done, total: progress("refine", done, total))
+
+
+def _sources(run: DiveRun, recording: RecordedCamera) -> dict[str, str]:
+    """What was read, and where the camera is from."""
+    stated = sources_of(recording)
+    if run.calibration is None:
+        assumed = "no calibration: a focal length was assumed and refined"
+        stated["calibration"] = "; ".join([*filter(None, [stated.get("calibration")]), assumed])
+    elif run.calibration is not recording.camera:
+        stated["calibration"] = "the calibration was given beside the recording"
+    return stated
 
 
 def _events(run: DiveRun, playback: Playback, source: SourceConfig) -> Iterator[Event]:

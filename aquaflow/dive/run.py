@@ -12,9 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from aquaflow.base.errors import InputError, NotMappedError, printable
 from aquaflow.base.stages import pace
 from aquaflow.config import Config
@@ -39,7 +36,7 @@ from aquaflow.recordings.kept_pictures import KeptPictures, PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import FinishTime, Slam
-from aquaflow.sources.picture_check import oddities
+from aquaflow.sources.picture_check import PictureCheck
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
@@ -47,9 +44,6 @@ from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)
 
-
-LOOKED_AT, LOOKED_STEP = 30, 4
-"""Pictures that are kept in small, 10 kB each, until the dive's end."""
 
 UNCHECKED = (
     "whether the calibration fits could not be checked: too few keyframes see the same places "
@@ -95,6 +89,8 @@ class DiveRun:
         """Result of the calibration check, if a calibration was given; known at the end."""
         self.found: FoundCamera | None = None
         """The camera of a dive without calibration, as far as its own pictures show it."""
+        self.sources: dict[str, str] = {}
+        """A sentence on each of what was read of a recording: times, calibration, white."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
         self.telemetry_log: TelemetryWriter | None = None
@@ -111,8 +107,8 @@ class DiveRun:
         """Of every frame that was read: preparing, tracking and mapping it."""
         self.first_pose_s: float | None = None
         """Seconds from the start of the run."""
-        self._first_pictures: list[npt.NDArray[np.uint8]] = []
-        """Every ``LOOKED_STEP``-th pixel of them: what they show says why nothing was mapped."""
+        self._check = PictureCheck()
+        """What the pictures show says why they could not be placed."""
         self._name_of, self._trace = name_of, trace
         self._cpu_before_s = time.process_time()
 
@@ -136,8 +132,7 @@ class DiveRun:
         if prepared is None:
             return []
         self._keep(prepared)
-        if len(self._first_pictures) < LOOKED_AT:
-            self._first_pictures.append(prepared.image[::LOOKED_STEP, ::LOOKED_STEP].copy())
+        self._check.add(prepared.image)
         decided = self.slam.process(prepared)
         self.decide(decided)
         self._time_frame(begun, decided)
@@ -274,6 +269,7 @@ class DiveRun:
         lost = sum(tracked.T_wc is None for tracked in results)
         if lost:
             self.notes.append(f"{lost} of {len(results)} frames got no pose")
+            self.notes += self._check.oddities()
         sub_maps = {tracked.sub_map for tracked in results if tracked.T_wc is not None}
         if len(sub_maps) > 1:
             self.notes.append(
@@ -312,7 +308,7 @@ class DiveRun:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
         if read < MIN_VIEWS:
             return f"{self.name} has {read} usable frames; a map needs at least {MIN_VIEWS}"
-        if odd := oddities(self._first_pictures, 1):
+        if odd := self._check.oddities():
             return f"{self.name}: none of {read} frames could be placed: {'; '.join(odd)}"
         return (
             f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
@@ -408,6 +404,7 @@ class DiveRun:
         numbers["self_calibration"] = None if self.found is None else self.found.to_json()
         in_base = self.slam.in_base
         numbers["in_site"] = None if in_base is None else in_site_numbers(in_base)
+        numbers["sources"] = self.sources
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

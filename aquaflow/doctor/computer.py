@@ -157,6 +157,7 @@ PACKAGES = (
         "pictures in recordings, for Foxglove and Lichtblick",
     ),
     Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags; a dive as ROS 2 messages"),
+    Package("zstandard", "zstandard", "recording", "compressed ROS 2 bags"),
     Package("websockets", "websockets", "foxglove", "a running dive in Foxglove"),
     Package("ray", "ray", "cluster", "batches of dives on several machines"),
     Package("s3fs", "s3fs", "s3", "batches of dives from and to S3"),

@@ -25,7 +25,7 @@ from pydantic import (
 from aquaflow.base.errors import ConfigError, path_of_key, words_of
 from aquaflow.base.errors.regular_file import read_mapping
 from aquaflow.base.storage.atomic import atomic_write, write_yaml
-from aquaflow.geometry.foreign_calibration import FISHEYE, values_of_file, values_of_yaml
+from aquaflow.geometry.foreign_calibration import MODELS, values_of_file, values_of_yaml
 from aquaflow.geometry.port import DomePortFile, FlatPortFile, Port, PortFile, as_stated, port_of
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
@@ -218,8 +218,8 @@ def load_camera(path: Path, inside: bool = False) -> CameraModel:
     if data is None:
         data = read_mapping(path, "calibration", "compare it with docs/formats.md", inside)
         data = values_of_yaml(path, data) or data
-    if data.get("distortion_model") in FISHEYE:
-        data["distortion_model"] = "fisheye"
+    if (model := MODELS.get(str(data.get("distortion_model")).lower())) is not None:
+        data["distortion_model"] = model
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:

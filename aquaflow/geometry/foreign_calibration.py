@@ -11,20 +11,25 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
-from aquaflow.base.errors import ConfigError, InputError, reason_of
+from aquaflow.base.errors import ConfigError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import MOST_BYTES
 
 Values = dict[str, Any]
 
-FISHEYE = frozenset({"equidistant", "kannala_brandt", "kannalabrandt4", "fisheye"})
-"""Names of the model that OpenCV calls fisheye (Kannala and Brandt, 2006)."""
-RADTAN = frozenset({"plumb_bob", "rational_polynomial", "radtan", "opencv", "brown", "radial"})
-"""Names of OpenCV's usual model."""
+Model = Literal["none", "radtan", "fisheye"]
+MODELS: dict[str, Model] = {
+    "equidistant": "fisheye", "kannala_brandt": "fisheye", "kannalabrandt4": "fisheye",
+    "fisheye": "fisheye", "plumb_bob": "radtan", "rational_polynomial": "radtan",
+    "radtan": "radtan", "opencv": "radtan", "brown": "radtan", "radial": "radtan",
+    "none": "none", "": "none",
+}  # fmt: skip
+"""Names of distortion models in other programs: of Kannala and Brandt (2006), which OpenCV calls
+fisheye, and of OpenCV's usual one."""
 
-COLMAP: dict[str, tuple[str, str]] = {
+COLMAP: dict[str, tuple[str, Model]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "none"),
     "PINHOLE": ("fx fy cx cy", "none"),
     "SIMPLE_RADIAL": ("f cx cy k1", "radtan"),
@@ -72,6 +77,65 @@ def values_of_yaml(path: Path, data: Values) -> Values | None:
     return None
 
 
+class _NotUnderstoodError(Exception):
+    """What of a calibration makes no sense, as a clause that follows its format."""
+
+
+class _Keys:
+    """Values of a calibration by key; what makes no sense is named by it."""
+
+    def __init__(self, values: Any) -> None:
+        if not isinstance(values, Mapping):
+            raise _NotUnderstoodError("it is no list of keys and values")
+        self._values: Mapping[str, Any] = values
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def value(self, key: str, usual: Any = None) -> Any:
+        """As it stands; ``usual`` where it is missing, unless that is None."""
+        if key not in self._values and usual is None:
+            raise _NotUnderstoodError(f"key '{key}' is missing")
+        return self._values.get(key, usual)
+
+    def number(self, key: str, usual: float | None = None) -> float:
+        return self._as_number(key, self.value(key, usual))
+
+    def numbers(self, key: str, least: int = 0) -> list[float]:
+        """Of a list, of rows, or of a matrix as ROS and OpenCV write it, row by row."""
+        found = self.value(key)
+        rows = found.get("data") if isinstance(found, Mapping) else found
+        if not isinstance(rows, (list, tuple)):
+            raise _NotUnderstoodError(f"key '{key}' is {_shown(found)}, which is no list")
+        flat: list[float] = []
+        for row in rows:
+            cells = row if isinstance(row, (list, tuple)) else [row]
+            flat += [self._as_number(key, cell) for cell in cells]
+        if len(flat) < least:
+            raise _NotUnderstoodError(f"key '{key}' holds {len(flat)} numbers instead of {least}")
+        return flat
+
+    def model(self, key: str, usual: str | None = None) -> Model:
+        """The distortion that the text at ``key`` names."""
+        name = self.value(key, usual)
+        known = MODELS.get(str(name).lower())
+        if known is None:
+            raise _NotUnderstoodError(f"key '{key}' is {_shown(name)}, which is not known")
+        return known
+
+    def _as_number(self, key: str, value: Any) -> float:
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            raise _NotUnderstoodError(f"key '{key}' is {_shown(value)}, which is no number") from (
+                None
+            )
+
+
+def _shown(value: Any) -> str:
+    return f"'{printable(str(value))[:40]}'"
+
+
 def _read(path: Path, reader: Any, content: Any) -> Values:
     name = {
         _xml: "Metashape or OpenCV", _odm: "OpenDroneMap", _colmap: "COLMAP", _kalibr: "Kalibr",
@@ -79,158 +143,142 @@ def _read(path: Path, reader: Any, content: Any) -> Values:
     }[reader]  # fmt: skip
     try:
         values: Values = reader(content)
-    except KeyError as error:
-        raise ConfigError(f"{path}: as a calibration of {name}, key {error} is missing") from error
-    except (TypeError, ValueError, IndexError, AttributeError, ElementTree.ParseError) as error:
-        raise ConfigError(f"{path}: as a calibration of {name}: {error}") from error
+    except _NotUnderstoodError as error:
+        raise ConfigError(f"{path}: as a calibration of {name}, {error}") from error
     return values
 
 
 def _values(
-    size: Sequence[Any], lens: Sequence[Any], model: str, distortion: Sequence[Any]
+    size: Sequence[float], lens: Sequence[float], model: Model, distortion: Sequence[float]
 ) -> Values:
     """``lens``: fx fy cx cy with pixel centres at 0.5."""
-    width, height = (int(float(side)) for side in size)
-    fx, fy, cx, cy = (float(value) for value in lens)
-    numbers = [float(value) for value in distortion]
-    kind = "none" if model != "fisheye" and not any(numbers) else model
+    kind = "none" if model != "fisheye" and not any(distortion) else model
+    fx, fy, cx, cy = lens
     return {
-        "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy,
-        "distortion_model": kind, "distortion": [] if kind == "none" else numbers,
+        "width": int(size[0]), "height": int(size[1]), "fx": fx, "fy": fy, "cx": cx, "cy": cy,
+        "distortion_model": kind, "distortion": [] if kind == "none" else list(distortion),
     }  # fmt: skip
 
 
-def _model(name: Any) -> str:
-    known = str(name).lower()
-    if known in FISHEYE:
-        return "fisheye"
-    if known in RADTAN:
-        return "radtan"
-    if known in ("none", ""):
-        return "none"
-    raise ValueError(f"key 'distortion_model': '{name}' is not known")
-
-
-def _matrix(value: Any) -> list[float]:
-    """A matrix as OpenCV and ROS write it, or as lists; row by row."""
-    rows = value["data"] if isinstance(value, Mapping) else value
-    flat: list[float] = []
-    for row in rows:
-        flat += [float(each) for each in row] if isinstance(row, (list, tuple)) else [float(row)]
-    return flat
+def _lens_of(k: Sequence[float]) -> tuple[float, float, float, float]:
+    """Of a 3 x 3 matrix whose pixel centres are integers."""
+    return k[0], k[4], k[2] + 0.5, k[5] + 0.5
 
 
 def _ros(data: Values) -> Values:
-    k = _matrix(data["camera_matrix"])
-    d = _matrix(data["distortion_coefficients"])
-    lens = (k[0], k[4], k[2] + 0.5, k[5] + 0.5)
-    size = (data["image_width"], data["image_height"])
-    return _values(size, lens, _model(data["distortion_model"]), d)
+    keys = _Keys(data)
+    size = (keys.number("image_width"), keys.number("image_height"))
+    lens, model = _lens_of(keys.numbers("camera_matrix", 9)), keys.model("distortion_model")
+    return _values(size, lens, model, keys.numbers("distortion_coefficients"))
 
 
 def _opencv(data: Values) -> Values:
-    names = {name.lower().replace("_", ""): value for name, value in data.items()}
-    k = _matrix(names["cameramatrix"] if "cameramatrix" in names else names["k"])
-    d: list[float] = []
-    for name in ("distortioncoefficients", "distcoeffs", "distortion", "d"):
-        if name in names:
-            d = _matrix(names[name])
-            break
-    if "imagewidth" in names:
-        size: Sequence[Any] = (names["imagewidth"], names["imageheight"])
-    elif "imagesize" in names:
-        size = _matrix(names["imagesize"])
+    keys = _Keys({name.lower().replace("_", ""): value for name, value in data.items()})
+    lens = _lens_of(keys.numbers("cameramatrix" if "cameramatrix" in keys else "k", 9))
+    names = ("distortioncoefficients", "distcoeffs", "distortion", "d")
+    d = next((keys.numbers(name) for name in names if name in keys), [])
+    if "imagesize" in keys and "imagewidth" not in keys:
+        size = keys.numbers("imagesize", 2)
+    elif "imagewidth" in keys:
+        size = [keys.number("imagewidth"), keys.number("imageheight")]
     else:
-        raise KeyError("image_width")
-    model = names.get("distortionmodel", names.get("cameramodel", "radtan"))
-    fisheye = str(names.get("fisheyemodel", 0)) not in ("0", "False", "false")
-    kind = "fisheye" if fisheye else _model("radtan" if model == "pinhole" else model)
-    return _values(size, (k[0], k[4], k[2] + 0.5, k[5] + 0.5), kind, d)
+        raise _NotUnderstoodError("key 'image_width' is missing")
+    if str(keys.value("fisheyemodel", 0)).lower() not in ("0", "false"):
+        return _values(size, lens, "fisheye", d)
+    named = "distortionmodel" if "distortionmodel" in keys else "cameramodel"
+    model = "radtan" if keys.value(named, "pinhole") == "pinhole" else keys.model(named)
+    return _values(size, lens, model, d)
 
 
 def _kalibr(cameras: list[Values]) -> Values:
     if len(cameras) > 1:
-        raise ValueError(f"it holds {len(cameras)} cameras; leave one of them, as cam0")
-    (camera,) = cameras
-    if camera["camera_model"] != "pinhole":
-        raise ValueError(f"key 'camera_model': '{camera['camera_model']}' is not known")
-    fx, fy, cx, cy = camera["intrinsics"]
-    model, d = _model(camera["distortion_model"]), camera["distortion_coeffs"]
-    return _values(camera["resolution"], (fx, fy, cx + 0.5, cy + 0.5), model, d)
+        raise _NotUnderstoodError(f"it holds {len(cameras)} cameras; leave one of them, as cam0")
+    keys = _Keys(cameras[0])
+    if (model := keys.value("camera_model")) != "pinhole":
+        raise _NotUnderstoodError(f"key 'camera_model' is {_shown(model)}, which is not known")
+    fx, fy, cx, cy = keys.numbers("intrinsics", 4)[:4]
+    size, d = keys.numbers("resolution", 2), keys.numbers("distortion_coeffs")
+    return _values(size, (fx, fy, cx + 0.5, cy + 0.5), keys.model("distortion_model"), d)
 
 
 def _colmap(text: str) -> Values:
     lines = [line.split() for line in text.splitlines() if line.strip() and line[0] != "#"]
     if len(lines) != 1:
-        raise ValueError(f"it holds {len(lines)} cameras; leave the line of one")
-    ((_, model, width, height, *numbers),) = lines
-    if model not in COLMAP:
-        raise ValueError(f"the camera model '{model}' is not known")
-    names, kind = COLMAP[model]
-    given = dict(zip(names.split(), map(float, numbers), strict=True))
-    focal = given.get("f", 0.0)
-    lens = (given.get("fx", focal), given.get("fy", focal), given["cx"], given["cy"])
-    return _values((width, height), lens, kind, _coefficients(given, kind))
+        raise _NotUnderstoodError(f"it holds {len(lines)} cameras; leave the line of one")
+    words = lines[0]
+    if len(words) < 4 or words[1] not in COLMAP:
+        named = f"model {_shown(words[1])} is not known" if len(words) > 3 else "its line is short"
+        raise _NotUnderstoodError(named)
+    names, kind = COLMAP[words[1]]
+    if len(words) != 4 + len(names.split()):
+        raise _NotUnderstoodError(f"{words[1]} has {len(words) - 4} numbers instead of: {names}")
+    keys = _Keys(dict(zip(("WIDTH", "HEIGHT", *names.split()), words[2:], strict=True)))
+    fx, fy = (keys.number("f" if "f" in keys else name) for name in ("fx", "fy"))
+    size = (keys.number("WIDTH"), keys.number("HEIGHT"))
+    return _values(size, (fx, fy, keys.number("cx"), keys.number("cy")), kind, _d_of(keys, kind))
 
 
-def _coefficients(given: Mapping[str, float], kind: str) -> list[float]:
-    """In OpenCV's order."""
+def _d_of(keys: _Keys, kind: Model) -> list[float]:
+    """Coefficients in OpenCV's order; those that are missing are zero."""
     if kind == "fisheye":
-        return [given.get(f"k{n}", 0.0) for n in (1, 2, 3, 4)]
+        return [keys.number(f"k{n}", 0.0) for n in (1, 2, 3, 4)]
     names = ["k1", "k2", "p1", "p2", "k3"]
-    names += ["k4", "k5", "k6"] if any(given.get(f"k{n}") for n in (4, 5, 6)) else []
-    return [given.get(name, 0.0) for name in names]
+    names += ["k4", "k5", "k6"] if any(keys.number(f"k{n}", 0.0) for n in (4, 5, 6)) else []
+    return [keys.number(name, 0.0) for name in names]
 
 
 def _xml(text: str) -> Values:
-    root = ElementTree.fromstring(text)
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise _NotUnderstoodError(f"it is damaged XML: {reason_of(error)}") from error
     if root.tag == "opencv_storage":
         return _opencv({child.tag: _of_storage(child) for child in root})
     found = root if root.tag == "calibration" else root.find(".//calibration")
     if found is None:
-        raise ValueError(f"<{root.tag}> holds no <calibration>")
-    given = {child.tag: (child.text or "").strip() for child in found}
+        raise _NotUnderstoodError(f"<{root.tag}> holds no <calibration>")
+    given = {child.tag: text for child in found if (text := (child.text or "").strip())}
+    keys = _Keys(given)
     kind = given.get("projection", found.get("type", "frame"))
     if kind != "frame":
-        raise ValueError(f"the projection '{kind}' is not known; only frame cameras are")
-    number = {
-        name: float(given.get(name) or 0.0)
-        for name in ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-    }
+        raise _NotUnderstoodError(f"projection {_shown(kind)} is not known; only 'frame' is")
     for name in ("k4", "b2", "p3", "p4"):
-        if number[name]:
-            raise ValueError(f"key '{name}' is not zero: fit the camera without it")
-    width, height, f = float(given["width"]), float(given["height"]), float(given["f"])
-    lens = (f + number["b1"], f, width / 2 + number["cx"], height / 2 + number["cy"])
+        if keys.number(name, 0.0):
+            raise _NotUnderstoodError(f"key '{name}' is not zero: fit the camera without it")
+    width, height, f = (keys.number(name) for name in ("width", "height", "f"))
+    centre = (width / 2 + keys.number("cx", 0.0), height / 2 + keys.number("cy", 0.0))
     # Metashape's P1 is OpenCV's p2 (manual of Metashape, appendix D).
-    d = [number[name] for name in ("k1", "k2", "p2", "p1", "k3")]
-    return _values((width, height), lens, "radtan", d)
+    d = [keys.number(name, 0.0) for name in ("k1", "k2", "p2", "p1", "k3")]
+    return _values((width, height), (f + keys.number("b1", 0.0), f, *centre), "radtan", d)
 
 
 def _of_storage(element: ElementTree.Element) -> Any:
     data = element.find("data")
     text = (element.text if data is None else data.text) or ""
-    numbers = text.split()
-    if data is not None or len(numbers) > 1:
-        return [float(each) for each in numbers]
-    return text.strip()
+    return text.split() if data is not None or len(text.split()) > 1 else text.strip()
 
 
 def _odm(text: str) -> Values:
-    cameras = json.loads(text)
-    if len(cameras) != 1:
-        raise ValueError(f"it holds {len(cameras)} cameras; leave one")
-    (camera,) = cameras.values()
-    kind = camera["projection_type"]
-    width, height = camera["width"], camera["height"]
+    try:
+        cameras = json.loads(text)
+    except ValueError as error:
+        raise _NotUnderstoodError("it is damaged JSON") from error
+    if not isinstance(cameras, dict) or len(cameras) != 1:
+        held = len(cameras) if isinstance(cameras, dict) else "no"
+        raise _NotUnderstoodError(f"it holds {held} cameras; leave one")
+    keys = _Keys(next(iter(cameras.values())))
+    kind = {
+        "perspective": "radtan", "brown": "radtan", "simple_radial": "radtan", "radial": "radtan",
+        "fisheye": "fisheye", "fisheye_opencv": "fisheye",
+    }.get(str(named := keys.value("projection_type")))  # fmt: skip
+    if kind is None:
+        raise _NotUnderstoodError(f"key 'projection_type' is {_shown(named)}, which is not known")
+    width, height = keys.number("width"), keys.number("height")
     side = max(width, height)  # OpenSfM's unit of length
-    focal = camera["focal_x"] if "focal_x" in camera else camera["focal"]
+    focal = keys.number("focal_x" if "focal_x" in keys else "focal")
     lens = (
-        focal * side, camera.get("focal_y", focal) * side,
-        width / 2 + camera.get("c_x", 0.0) * side, height / 2 + camera.get("c_y", 0.0) * side,
+        focal * side, keys.number("focal_y", focal) * side,
+        width / 2 + keys.number("c_x", 0.0) * side, height / 2 + keys.number("c_y", 0.0) * side,
     )  # fmt: skip
-    if kind in ("perspective", "brown", "simple_radial", "radial"):
-        return _values((width, height), lens, "radtan", _coefficients(camera, "radtan"))
-    if kind in ("fisheye", "fisheye_opencv"):
-        return _values((width, height), lens, "fisheye", _coefficients(camera, "fisheye"))
-    raise ValueError(f"key 'projection_type': '{kind}' is not known")
+    model = MODELS[kind]
+    return _values((width, height), lens, model, _d_of(keys, model))

@@ -7,21 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.geometry.camera import CameraModel, DistortionModel
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.foreign_calibration import MODELS
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 """Message with a camera's calibration."""
 TRANSPORTS = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg")
 """What image_transport appends to a picture topic."""
-DISTORTIONS: dict[str, DistortionModel] = {
-    "plumb_bob": "radtan",
-    "rational_polynomial": "radtan",
-    "radtan": "radtan",
-    "equidistant": "fisheye",
-    "kannala_brandt": "fisheye",
-    "fisheye": "fisheye",
-}
-"""ROS's distortion models, and the names here of those that are known."""
 NOT_SCENES = ("depth", "disparity", "mask", "segment", "confidence", "infra", "thermal", "sonar")
 """Parts of the names of topics whose pictures are not what a colour camera saw."""
 
@@ -63,7 +55,7 @@ def camera_of_info(info: Any, rectified: bool) -> CameraModel | str:
     fields = {name.lower(): value for name, value in vars(info).items()}
     k, p = np.asarray(fields["k"], np.float64), np.asarray(fields["p"], np.float64)
     d = tuple(float(value) for value in fields["d"])
-    model = DISTORTIONS.get(str(info.distortion_model))
+    model = MODELS.get(str(info.distortion_model).lower())
     if rectified and p[0] > 0.0:
         fx, fy, cx, cy = p[0], p[5], p[2], p[6]
     else:
@@ -72,7 +64,7 @@ def camera_of_info(info: Any, rectified: bool) -> CameraModel | str:
         return "its focal length is not above zero: it was never calibrated"
     if rectified:
         model, d = "none", ()
-    elif model is None and any(d):
+    elif model in (None, "none") and any(d):
         return f"its distortion model '{info.distortion_model}' is not known"
     elif model is None or not d:
         model, d = "none" if model != "fisheye" else model, ()

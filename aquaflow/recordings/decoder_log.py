@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import os
 import threading
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+# OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 ERROR = 16
 """FFmpeg's AV_LOG_ERROR: a picture, or a part of it, that could not be decoded."""

@@ -6,6 +6,7 @@ import io
 import re
 from collections import deque
 from collections.abc import Iterator
+from contextlib import ExitStack
 from itertools import chain
 from typing import Any, Generic, TypeVar
 
@@ -37,7 +38,8 @@ class AccessUnits(io.BufferedIOBase, Generic[Label]):
     def __init__(self, units: Iterator[tuple[Label, bytes]]) -> None:
         self._units = units
         self._rest = b""
-        self.read_but_not_decoded: deque[Label] = deque()
+        self.read_but_not_decoded: deque[tuple[Label, bool]] = deque()
+        """Their labels, and whether decoding can begin with them."""
 
     def read(self, size: int | None = -1) -> bytes:
         wanted = -1 if size is None else size
@@ -45,7 +47,7 @@ class AccessUnits(io.BufferedIOBase, Generic[Label]):
             unit = next(self._units, None)
             if unit is None:
                 break
-            self.read_but_not_decoded.append(unit[0])
+            self.read_but_not_decoded.append((unit[0], is_key(unit[1])))
             self._rest += unit[1]
         end = len(self._rest) if wanted < 0 else wanted
         data, self._rest = self._rest[:end], self._rest[end:]
@@ -65,7 +67,8 @@ class AccessUnits(io.BufferedIOBase, Generic[Label]):
 def decode_units(
     units: Iterator[tuple[Label, bytes]],
 ) -> Iterator[tuple[Label, npt.NDArray[np.uint8] | None]]:
-    """Each label with its picture [H, W, 3] RGB; None for units that gave none.
+    """Each label with its picture [H, W, 3] RGB; None for units that gave none, or a damaged one,
+    and for those after it up to the next with which decoding can begin.
 
     Assumes what foxglove.CompressedVideo demands: one picture a unit, no B-frames. A damaged unit
     in the middle may give no picture; then the labels after it move up by one.
@@ -81,25 +84,26 @@ def decode_units(
         return
     stream = AccessUnits(chain([first], units))
     source: Any = stream  # OpenCV's stubs know only its own class of streams
-    software = [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE]
+    # One thread: several decode ahead, so that a complaint belongs to no certain picture.
+    options = [cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE, cv2.CAP_PROP_N_THREADS, 1]
     try:
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, software)
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
     except (TypeError, cv2.error) as error:
         raise InputError("decoding recorded video needs opencv-python-headless 5") from error
-    try:
-        with DecoderLog() as decoder:
-            while True:
-                decoded, bgr = capture.read()
-                if not decoded or not stream.read_but_not_decoded:
-                    break
-                label = stream.read_but_not_decoded.popleft()
-                if decoder.complaints():
-                    yield label, None
-                    continue
+    damaged = False
+    with DecoderLog() as decoder, ExitStack() as stack:
+        stack.callback(capture.release)
+        while True:
+            decoded, bgr = capture.read()
+            if not decoded or not stream.read_but_not_decoded:
+                break
+            label, key = stream.read_but_not_decoded.popleft()
+            damaged = bool(decoder.complaints()) or (damaged and not key)
+            if damaged:
+                yield label, None
+            else:
                 yield label, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    finally:
-        capture.release()
-    yield from ((label, None) for label in stream.read_but_not_decoded)
+    yield from ((label, None) for label, _ in stream.read_but_not_decoded)
 
 
 def _first_key(

@@ -1,10 +1,9 @@
-"""A folder of pictures as a camera."""
+"""A folder of pictures as a camera, and the places in their EXIF as telemetry."""
 
 from __future__ import annotations
 
 import contextlib
 import re
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from datetime import datetime, timezone
@@ -14,20 +13,21 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.errors import InputError, printable
+from aquaflow.drivers.samples import plausible, sigma_of
 from aquaflow.geometry.camera import guess_camera, load_camera
+from aquaflow.recordings.exif import place_taken, time_taken
 from aquaflow.recordings.picture import (
     EXTENSIONS,
-    TWELVE_BITS,
+    Stored,
     UnreadablePictureError,
+    WhiteLevel,
     decode_picture,
-    probe_size,
+    probe,
     read_picture,
     received_as,
     stated_white,
-    to_rgb,
-    white_of_16,
 )
-from aquaflow.types import CameraModel, Dropped, Frame
+from aquaflow.types import CameraModel, Dropped, Frame, Position, TelemetrySample
 
 DEFAULT_FPS = 10.0
 """Pictures without times; stills from survey vehicles come at 1 to 10 a second."""
@@ -39,6 +39,8 @@ CALIBRATION = "camera.yaml"
 SUBFOLDER = "images"
 """The pictures may be in this folder of the one that is named; so may both files."""
 
+MOST_NAMED = 8
+"""Names that are said of what lies in a folder."""
 NS_PER_S = 1_000_000_000
 """Nanoseconds of a second."""
 
@@ -63,17 +65,16 @@ class ImageFolder:
         self.files = _pictures_of(folder)
         self.frame_count: int | None = len(self.files)
         self._reasons: dict[int, str] = {}
-        self._facts: list[str] = []
+        self._turned = 0
+        self._facts: dict[str, str] = {}
         self.width, self.height = self._majority_size()
-        self._times_ns, source = _times_ns(_sidecar(folder, TIMESTAMPS), self.files, fps)
-        self._facts.append(source)
+        stamps = _sidecar(folder, TIMESTAMPS)
+        self._times_ns, self._facts["times"] = _times_ns(stamps, self.files, fps)
         calibration = _sidecar(folder, CALIBRATION)
         self.camera: CameraModel | None = load_camera(calibration) if calibration else None
         if calibration is not None:
-            self._facts.append(f"the calibration is {calibration}")
-        self._white: int | None = None
-        self.notes: list[str] = []
-        self._update_notes()
+            self._facts["calibration"] = f"the calibration is {calibration}"
+        self._white = WhiteLevel()
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -98,56 +99,40 @@ class ImageFolder:
     def close(self) -> None:
         """Nothing stays open between frames."""
 
+    def time_of(self, index: int) -> int:
+        """ns from the first picture to that at ``index``."""
+        return self._times_ns[index]
+
     def _frame(self, index: int) -> Frame | Dropped:
-        t_ns = self._times_ns[index]
+        t_ns = self.time_of(index)
         if index not in self._reasons:
             try:
                 data = self.files[index].read_bytes()
                 picture = decode_picture(data)
             except (UnreadablePictureError, OSError) as error:
                 self._reasons[index] = f"{self.name_of(index)} {error}"
-                self._update_notes()
         if index in self._reasons:
             return Dropped(index, t_ns, self._reasons[index])
-        if picture.dtype != np.uint8 and self._white is None:
-            self._white = self._folder_white(data)
-            self._update_notes()
-        image = to_rgb(picture, self._white or 1)
+        image = self._white.to_rgb(picture, lambda: stated_white(data), self._whole)
         camera = self.camera or guess_camera(image.shape[1], image.shape[0])
         # 16 bits mean nothing without the white of their folder.
         encoded = received_as(data) if picture.dtype == np.uint8 else None
         return Frame(index, t_ns, t_ns, image, camera, encoded=encoded)
 
-    def _folder_white(self, first: bytes) -> int:
-        """White of the 16-bit pictures: one value for all, or brightness would jump; as the first
-        states it, else of all of them, up to one that needs all 16 bits."""
-        white = stated_white(first)
-        if white is not None:
-            self._facts.append(f"white is {white - 1} in pictures of 16 bits, as their header says")
-            return white
-        white = TWELVE_BITS
-        for index in range(len(self.files)):
-            if index in self._reasons:
-                continue
-            try:
-                picture = read_picture(self.files[index])
-            except UnreadablePictureError:
-                continue
-            if picture.dtype != np.uint8 and white_of_16(picture) > white:
-                white = 1 << 16
-                break
-        self._facts.append(
-            f"white is assumed to be {white - 1} in pictures of 16 bits: "
-            + ("none is brighter" if white == TWELVE_BITS else f"values above {TWELVE_BITS} occur")
-        )
-        return white
+    def _whole(self) -> Iterator[Stored]:
+        for index, file in enumerate(self.files):
+            if index not in self._reasons:
+                with contextlib.suppress(UnreadablePictureError):
+                    yield read_picture(file)
 
     def _majority_size(self) -> tuple[int, int]:
         """The most frequent size, the earlier on a tie; others are marked as dropped."""
         sizes: dict[int, tuple[int, int]] = {}
         for index, file in enumerate(self.files):
             try:
-                sizes[index] = probe_size(file)
+                width, height, turned = probe(file)
+                sizes[index] = width, height
+                self._turned += turned
             except UnreadablePictureError as error:
                 self._reasons[index] = f"{self.name_of(index)} {error}"
         if not sizes:
@@ -163,14 +148,72 @@ class ImageFolder:
                 )
         return width, height
 
-    def _update_notes(self) -> None:
-        self.notes = list(self._facts)
+    def sources(self) -> dict[str, str]:
+        """Of times, calibration, white and position."""
+        found = self._facts | self._white.sources
+        if self._turned:
+            found["position"] = f"{self._turned} pictures are turned as their EXIF says"
+        return found
+
+    @property
+    def notes(self) -> list[str]:
+        """The sources, and what was left out."""
+        found = list(self.sources().values())
         if self._reasons:
             first = self._reasons[min(self._reasons)]
-            self.notes += [
+            found.append(
                 f"{len(self._reasons)} of {len(self.files)} pictures were left out; the first: "
                 f"{first}"
-            ]
+            )
+        return found
+
+
+class StillsTelemetry:
+    """Places in the EXIF of a folder's pictures, at the pictures' times."""
+
+    specificity = 1
+
+    def __init__(self, folder: Path, starts_s: float = 0.0) -> None:
+        """Open nothing yet."""
+        self.folder = folder
+        self._fps: float | None = None
+        self.notes: list[str] = []
+        self._shift_ns = round(starts_s * NS_PER_S)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        if not path.is_dir():
+            return False
+        with contextlib.suppress(InputError):
+            return place_taken(_pictures_of(path)[0]) is not None
+        return False
+
+    @classmethod
+    def open(cls, path: Path, starts_s: float = 0.0) -> StillsTelemetry:
+        return cls(path, starts_s)
+
+    def follow(self, fps: float | None, topic: str | None) -> None:
+        """``fps`` is the rate of pictures of which the folder says no times."""
+        self._fps = fps
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """A fix for each picture that has one.
+
+        Raises:
+            InputError: no picture can be read, or the times are malformed.
+        """
+        pictures = ImageFolder(self.folder, self._fps)
+        for index, file in enumerate(pictures.files):
+            place = place_taken(file)
+            if place is not None:
+                t_ns = pictures.time_of(index) + self._shift_ns
+                sigma_m = place.sigma_m or sigma_of(None)
+                fix = Position(t_ns, t_ns, "EXIF", *place[:2], sigma_m)
+                if plausible(fix):
+                    yield fix
+
+    def close(self) -> None:
+        """Nothing stays open between passes."""
 
 
 def _pictures_of(folder: Path) -> list[Path]:
@@ -188,9 +231,10 @@ def _pictures_of(folder: Path) -> list[Path]:
             if None not in times and len({time[0] for time in times if time}) == 1:
                 return sorted(found, key=lambda file: (time_of_name(file.stem), file.name))
             return sorted(found, key=_natural_key)
+    others = sorted(printable(file.name) for file in folder.iterdir())[:MOST_NAMED]
     raise InputError(
         f"{folder} holds no picture; give a folder with {', '.join(sorted(EXTENSIONS))} files or "
-        "a video file"
+        f"a video file; in it {'are ' + ', '.join(others) if others else 'is nothing'}"
     )
 
 
@@ -259,7 +303,7 @@ def _times_ns(stamps: Path | None, files: list[Path], fps: float | None) -> tupl
     if (named := _increasing(time_of_name(file.stem) for file in files)) is not None:
         kind, times = named
         return times, f"the times of the pictures are the {kind} in their names"
-    if (taken := _increasing(_exif_time(file) for file in files)) is not None:
+    if (taken := _increasing(time_taken(file) for file in files)) is not None:
         return taken[1], "the times of the pictures are those of their EXIF"
     return _evenly(len(files), DEFAULT_FPS), (
         f"the times of the pictures are not known: {DEFAULT_FPS:g} a second are assumed; give "
@@ -285,26 +329,6 @@ def _increasing(times: Iterable[tuple[str, int] | None]) -> tuple[str, list[int]
     if any(after <= before for before, after in pairwise(ns)):
         return None
     return known[0][0], [time - ns[0] for time in ns]
-
-
-EXIF_IFD, TAKEN, SUBSECONDS = 0x8769, 0x9003, 0x9291
-"""EXIF: the directory of the camera, when the picture was taken, and decimals of that."""
-
-
-def _exif_time(file: Path) -> tuple[str, int] | None:
-    from PIL import Image
-
-    if file.suffix.lower() not in (".jpg", ".jpeg", ".tif", ".tiff"):
-        return None
-    with warnings.catch_warnings(), contextlib.suppress(Exception):  # Pillow has many for bad EXIF
-        warnings.simplefilter("ignore")
-        with Image.open(file) as picture:
-            exif = picture.getexif().get_ifd(EXIF_IFD)
-        moment = datetime.strptime(str(exif[TAKEN]), "%Y:%m:%d %H:%M:%S")
-        whole = int(moment.replace(tzinfo=timezone.utc).timestamp())
-        digits = re.sub(r"\D", "", str(exif.get(SUBSECONDS, "")))[:9]
-        return "EXIF", whole * NS_PER_S + _decimals_ns(digits)
-    return None
 
 
 def _read_stamps(path: Path) -> list[float]:

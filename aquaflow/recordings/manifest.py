@@ -30,6 +30,7 @@ from aquaflow.sources import (
     RecordedTelemetry,
     open_recorded_telemetry,
     open_recording,
+    sources_of,
 )
 from aquaflow.types import Dropped, Frame, TelemetrySample
 
@@ -109,9 +110,9 @@ class MountedCamera:
     def notes(self) -> list[str]:
         return self._recording.notes
 
-    @notes.setter
-    def notes(self, notes: list[str]) -> None:
-        self._recording.notes = notes
+    def sources(self) -> dict[str, str]:
+        """Of what the recording itself states."""
+        return sources_of(self._recording)
 
     def stated_mounting(self) -> MountingConfig:
         """As the manifest states it."""

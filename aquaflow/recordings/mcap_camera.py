@@ -7,7 +7,9 @@ import binascii
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -26,8 +28,17 @@ from aquaflow.geometry.camera import (
 from aquaflow.recordings.camera_info import camera_of_info, choose_topic, info_topic, is_rectified
 from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
-from aquaflow.recordings.picture import UnreadablePictureError, received_as
-from aquaflow.recordings.picture_message import compressed_picture, raw_picture
+from aquaflow.recordings.picture import (
+    Stored,
+    UnreadablePictureError,
+    WhiteLevel,
+    decode_picture,
+    received_as,
+    stated_white,
+    to_rgb,
+)
+from aquaflow.recordings.picture_message import raw_picture
+from aquaflow.recordings.rosbag import stamp_of
 from aquaflow.sources import is_asked
 from aquaflow.types import Dropped, EncodedPicture, Frame
 
@@ -38,6 +49,8 @@ COMPRESSED, RAW, VIDEO = "CompressedImage", "RawImage", "CompressedVideo"
 """Foxglove's messages."""
 RAW_NAMES = frozenset({RAW, "Image"})
 """Foxglove's and ROS's messages of pictures that are not compressed."""
+ROS_ENCODINGS = ("ros1", "cdr")
+"""Of messages, in ROS 1 and ROS 2."""
 OURS = "aquaflow"
 """Name of the metadata that AquaFlow's recorder writes."""
 MOUNTING = "mounting"
@@ -84,13 +97,16 @@ class McapCamera:
         self.topic = first.topic
         self._base = first.topic.rpartition("/")[0]
         self._ours = OURS in self._messages.facts
-        self._damage: list[str] = []
+        self._facts: dict[str, str] = {}
+        self._white = WhiteLevel()
         self._stated = self._calibration()
         """As every frame carried it, be it only a guess."""
         known = self._stated is not None and self._stated.calibrated
         self.camera: CameraModel | None = self._stated if known else None
-        self.frame_count: int | None = self._count(self._messages.counts())
-        self.notes: list[str] = list(self._damage)
+        self.frame_count: int | None = self._count(self._messages.counts)
+        if others := self._other_topics():
+            also = f"also there: {', '.join(others)} (choose by --topic)"
+            self._facts["topic"] = f"{self.topic} is used; {also}"
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -98,7 +114,19 @@ class McapCamera:
 
     @classmethod
     def open(cls, path: Path, fps: float | None = None) -> McapCamera:
-        return cls(path)
+        camera = cls(path)
+        if fps is not None:
+            camera._facts["times"] = f"--fps is not used: {path.name} has times of its own"
+        return camera
+
+    def sources(self) -> dict[str, str]:
+        """Of calibration, topic and white."""
+        return self._facts | self._white.sources
+
+    @property
+    def notes(self) -> list[str]:
+        """The sources, and what was left out."""
+        return [*self.sources().values(), *self._messages.notes]
 
     @classmethod
     def topic_of(cls, path: Path, topic: str) -> McapCamera:
@@ -125,7 +153,6 @@ class McapCamera:
                 break
             if is_asked(frame.index, every, start):
                 yield frame
-        self.notes = [*self._damage, *self._messages.notes]
         if not any_read:
             raise InputError(f"{self.path} holds no picture any more: {'; '.join(self.notes)}")
 
@@ -151,14 +178,14 @@ class McapCamera:
     def _choose_topic(self) -> str | None:
         """The picture topic that suits best, where there are several and none is ours."""
         heads = []
-        for each in self._messages.heads():
+        for each in self._messages.heads:
             if OURS in self._messages.facts:
                 return None
             heads.append(each)
         found = [each.topic for each in heads if picture_kind(each) is not None]
         if len(found) < 2:
             return None
-        counts = self._messages.counts() or Counter(each.topic for each in heads)
+        counts = self._messages.counts or Counter(each.topic for each in heads)
         return choose_topic((topic, counts.get(topic, 0)) for topic in found)
 
     def _first_picture(self, camera: str | None, topic: str | None) -> tuple[McapMessage, int]:
@@ -176,10 +203,13 @@ class McapCamera:
                 and topic in (None, message.topic)
             ):
                 self._kind = kind
-                return message, missing.get(base, message.publish_ns)
+                taken_ns = message.publish_ns
+                with suppress(UnreadablePayloadError):
+                    taken_ns = _taken_ns(message, self._payloads.decode(message))
+                return message, missing.get(base, taken_ns)
         which = "" if camera is None else f" of camera '{camera}'"
         which += "" if topic is None else f" on {topic}"
-        known = ", ".join(sorted(message.topic for message in self._messages.heads())) or "none"
+        known = ", ".join(sorted(message.topic for message in self._messages.heads)) or "none"
         raise InputError(
             f"{self.path} holds no picture{which}; give a recording with a camera; its topics are: "
             f"{known}"
@@ -192,19 +222,20 @@ class McapCamera:
         try:
             fields = json.loads(facts["model"])
             if has_unmeasured_port(fields):
-                self._damage.append(
+                self._facts["calibration"] = (
                     f"the calibration in {self.path.name} names a {fields['port']['kind']} port "
                     "without its measures, which was left out; give --calib with them"
                 )
             return camera_of_values(fields)
         except (KeyError, TypeError, ValueError, RecursionError):
-            self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
+            said = f"the calibration in {self.path.name} is damaged and was left out"
+            self._facts["calibration"] = said
             return None
 
     def _camera_info(self) -> CameraModel | None:
         """Of the CameraInfo of ROS that belongs to the topic."""
         found: dict[str, McapMessage] = {}
-        for message in self._messages.heads():
+        for message in self._messages.heads:
             name = "" if message.schema is None else message.schema.name.replace("/msg/", "/")
             if name == "sensor_msgs/CameraInfo":
                 found.setdefault(message.topic, message)
@@ -216,9 +247,9 @@ class McapCamera:
         except (UnreadablePayloadError, AttributeError, KeyError):
             camera = "it cannot be read"
         if isinstance(camera, str):
-            self._damage.append(f"{topic} is not used: {camera}")
+            self._facts["calibration"] = f"{topic} is not used: {camera}"
             return None
-        self._damage.append(f"the calibration of {self.topic} is that of {topic}")
+        self._facts["calibration"] = f"the calibration of {self.topic} is that of {topic}"
         return camera
 
     def _count(self, counts: dict[str, int] | None) -> int | None:
@@ -236,7 +267,8 @@ class McapCamera:
         for count, message in _number_messages(self._messages.of(topics.__contains__), self.topic):
             kind = topics[message.topic]
             if kind == "mask":
-                mask = compressed_picture(self._payloads.decode(message).data)[..., 0] > 0
+                data = self._payloads.decode(message).data
+                mask = to_rgb(decode_picture(data), 1)[..., 0] > 0
             elif kind == "exposure":
                 extra = json.loads(message.data)
             else:
@@ -259,20 +291,34 @@ class McapCamera:
                 yield Dropped(place.index, place.t_ns, found)
                 continue
             try:
-                image, encoded = self._decode(found)
+                fields = self._payloads.decode(found)
+                stored, data = self._stored(fields)
             except (UnreadablePictureError, UnreadablePayloadError) as error:
                 yield Dropped(place.index, place.t_ns, f"{self.name_of(place.index)} {error}")
                 continue
-            yield self._frame(place, image, encoded)
+            image = self._white.to_rgb(stored, partial(stated_white, data), self._whole)
+            plain = self._kind == COMPRESSED and stored.dtype == np.uint8
+            taken = replace(place, t_ns=_taken_ns(found, fields) - self.origin_ns)
+            yield self._frame(taken, image, received_as(data) if plain else None)
 
-    def _decode(self, message: McapMessage) -> tuple[npt.NDArray[np.uint8], EncodedPicture | None]:
-        fields = self._payloads.decode(message)
+    def _stored(self, fields: Any) -> tuple[Stored, bytes]:
+        """The picture, and the bytes of its file."""
+        data = bytes(fields.data)
         if self._kind == COMPRESSED:
-            data = bytes(fields.data)
-            return compressed_picture(data), received_as(data)
+            return decode_picture(data), data
         shape = (fields.height, fields.width, fields.step)
         big_endian = bool(getattr(fields, "is_bigendian", False))  # of ROS; foxglove's never are
-        return raw_picture(bytes(fields.data), *shape, fields.encoding, big_endian), None
+        return raw_picture(data, *shape, fields.encoding, big_endian), data
+
+    def _whole(self) -> Iterator[Stored]:
+        for message in McapMessages(self._messages.files).of(self.topic.__eq__):
+            with suppress(UnreadablePictureError, UnreadablePayloadError):
+                yield self._stored(self._payloads.decode(message))[0]
+
+    def _other_topics(self) -> list[str]:
+        heads = (each for each in self._messages.heads if picture_kind(each) is not None)
+        masks = f"{self._base}/mask"
+        return sorted({each.topic for each in heads} - {self.topic, masks})
 
     def _video(self) -> Iterator[Frame | Dropped]:
         gone: list[Dropped] = []
@@ -305,6 +351,12 @@ class McapCamera:
         camera = self._stated or guess_camera(width, height)
         frame = Frame(place.index, place.t_ns, place.arrival_ns, image, camera, encoded=encoded)
         return replace(frame, exposure_s=place.exposure_s, gain=place.gain, mask=place.mask)
+
+
+def _taken_ns(message: McapMessage, fields: Any) -> int:
+    """When the picture was taken: by the header of ROS, else when the message was published."""
+    in_ros = message.encoding in ROS_ENCODINGS
+    return stamp_of(fields, message.log_ns) if in_ros else message.publish_ns
 
 
 def _number_messages(
@@ -362,7 +414,7 @@ def _decoder(encoding: str, schema: Schema) -> Decode:
             return decode
     if encoding == "json":
         return _from_json
-    if encoding in ("ros1", "cdr"):
+    if encoding in ROS_ENCODINGS:
         return _ros(encoding, schema)
     raise UnreadablePayloadError(f"is encoded as '{encoding}'")
 

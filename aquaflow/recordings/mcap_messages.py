@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, cast
 
@@ -78,17 +79,18 @@ class McapMessages:
             except OSError as error:
                 self.notes.append(f"{file.name} cannot be read: {error.strerror}")
 
-    def heads(self) -> Iterator[McapMessage]:
+    @cached_property
+    def heads(self) -> list[McapMessage]:
         """The first message of every topic, as far as ``HEAD`` messages reach; no message is read
         after those of all topics that the summary names."""
-        left, seen = set(self.counts() or ()), set[str]()
+        left, seen = set(self.counts or ()), dict[str, McapMessage]()
         for _, message in zip(range(HEAD), self, strict=False):
-            if message.topic not in seen:
-                seen.add(message.topic)
-                yield message
-                if left and left <= seen:
-                    return
+            seen.setdefault(message.topic, message)
+            if left and left <= seen.keys():
+                break
+        return list(seen.values())
 
+    @cached_property
     def counts(self) -> dict[str, int] | None:
         """Messages by topic from the files' summaries; None if one was cut off before it."""
         from mcap.exceptions import McapError

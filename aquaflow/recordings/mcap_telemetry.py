@@ -13,7 +13,7 @@ from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_fi
 from aquaflow.recordings.rosbag import stamp_of
 from aquaflow.recordings.rosbag_telemetry import CONVERSIONS
 from aquaflow.recordings.telemetry_json import sample_from_json
-from aquaflow.recordings.telemetry_log import DecodedReads, Read
+from aquaflow.recordings.telemetry_log import DecodedReads, LoggedUtc, Read
 from aquaflow.types import KINDS, TelemetrySample
 
 TELEMETRY = "/telemetry/"
@@ -35,7 +35,7 @@ class McapTelemetry:
         """
         self.path = path
         self._messages = McapMessages(mcap_files(path))
-        self.origin_ns = self._origin() if origin_ns is None else origin_ns
+        self.origin_ns = self._origin(None) if origin_ns is None else origin_ns
         self.invalid = 0
         """Messages that are no samples."""
 
@@ -49,13 +49,19 @@ class McapTelemetry:
         telemetry.origin_ns -= round(starts_s * 1e9)
         return telemetry
 
+    def follow(self, fps: float | None, topic: str | None) -> None:
+        """Times count from the first picture of ``topic``."""
+        if topic is not None:
+            self.origin_ns += self._origin(topic) - self._origin(None)
+
     def samples(self) -> Iterator[TelemetrySample]:
         """The samples as they were decoded during the dive; of ROS's messages, as of a bag."""
         self.invalid = 0
         payloads = Payloads()
+        utc = LoggedUtc(f"{self.path.stem}/bag", iter([(0, self.origin_ns)]))
         for message in self._messages:
             if not message.topic.startswith(TELEMETRY):
-                yield from self._of_ros(message, payloads)
+                yield from self._of_ros(message, payloads, utc)
                 continue
             kind = message.topic.rpartition("/")[2]
             try:
@@ -71,19 +77,23 @@ class McapTelemetry:
                 arrival_ns=sample.arrival_ns - self.origin_ns,
             )
 
-    def _of_ros(self, message: McapMessage, payloads: Payloads) -> list[TelemetrySample]:
+    def _of_ros(
+        self, message: McapMessage, payloads: Payloads, utc: LoggedUtc
+    ) -> Iterator[TelemetrySample]:
         name = "" if message.schema is None else message.schema.name
         convert = CONVERSIONS.get(name if "/msg/" in name else name.replace("/", "/msg/", 1))
         if convert is None:
-            return []
+            return
         arrival_ns = message.log_ns - self.origin_ns
+        yield from utc.at(arrival_ns, message.log_ns)
         try:
             fields = payloads.decode(message)
             t_ns = min(stamp_of(fields, message.log_ns) - self.origin_ns, arrival_ns)
-            return convert(fields, t_ns, arrival_ns, message.topic.strip("/"))
+            found = convert(fields, t_ns, arrival_ns, message.topic.strip("/"))
         except (UnreadablePayloadError, ValueError, ZeroDivisionError, AttributeError):
             self.invalid += 1
-            return []
+            return
+        yield from found
 
     def link_bytes(self) -> Iterator[Read]:
         """Every read of every link, as it came."""
@@ -108,9 +118,9 @@ class McapTelemetry:
     def close(self) -> None:
         """Nothing stays open between passes."""
 
-    def _origin(self) -> int:
+    def _origin(self, topic: str | None) -> int:
         try:
-            return McapCamera(self.path).origin_ns
+            return McapCamera(self.path, topic=topic).origin_ns
         except InputError:
             first = next(iter(self._messages), None)
             return 0 if first is None else first.log_ns

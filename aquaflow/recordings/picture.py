@@ -7,16 +7,21 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.recordings.exif import UPRIGHT, orientation_of
 from aquaflow.types import EncodedPicture
 
 EXTENSIONS = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm"})
 """Of pictures that Pillow reads."""
+
+LYING = frozenset({5, 6, 7, 8})
+"""Orientations of EXIF whose width is the height of the upright picture."""
 
 TWELVE_BITS = 1 << 12
 """Industrial cameras store 12 bits in 16; taking the high byte of those leaves 16 grey levels."""
@@ -25,12 +30,17 @@ GREY_16_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "I"})
 """Pillow's modes of 16-bit grey; as I it has widened them to 32 bits."""
 
 
+Stored: TypeAlias = npt.NDArray[np.uint8 | np.int32]
+"""[H, W, 3] uint8 RGB; what has 16 bits as int32 as stored, [H, W] or [H, W, 3]."""
+
+
 class UnreadablePictureError(Exception):
     """A picture that cannot be decoded; the message is a reason that follows its name."""
 
 
-def probe_size(path: Path) -> tuple[int, int]:
-    """Width and height (px) from the file's header, without decoding.
+def probe(path: Path) -> tuple[int, int, bool]:
+    """Width and height (px) of the upright picture, from the file's header, without decoding; and
+    whether it is stored in another position.
 
     Raises:
         UnreadablePictureError: the header is not that of a picture.
@@ -41,12 +51,14 @@ def probe_size(path: Path) -> tuple[int, int]:
         warnings.simplefilter("ignore")
         try:
             with Image.open(path) as picture:
-                return picture.size
+                (width, height), number = picture.size, orientation_of(picture)
+                size = (height, width) if number in LYING else (width, height)
+                return *size, number != UPRIGHT
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise UnreadablePictureError("cannot be read as a picture") from error
 
 
-def read_picture(path: Path) -> npt.NDArray[np.uint8 | np.int32]:
+def read_picture(path: Path) -> Stored:
     """Decode a file; see :func:`decode_picture`.
 
     Raises:
@@ -58,15 +70,15 @@ def read_picture(path: Path) -> npt.NDArray[np.uint8 | np.int32]:
         raise UnreadablePictureError("cannot be read") from error
 
 
-def decode_picture(data: bytes) -> npt.NDArray[np.uint8 | np.int32]:
+def decode_picture(data: bytes) -> Stored:
     """Decode to [H, W, 3] uint8 RGB; what has 16 bits to int32 as stored, [H, W] or [H, W, 3].
 
-    Grey of 8 bits becomes RGB, transparency is dropped.
+    Grey of 8 bits becomes RGB, transparency is dropped, and what EXIF says to lie is turned.
 
     Raises:
         UnreadablePictureError: the data are damaged or their pixel type is unknown.
     """
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -77,7 +89,9 @@ def decode_picture(data: bytes) -> npt.NDArray[np.uint8 | np.int32]:
                 if _has_16_bits(picture, data):
                     return _colour_16(data)
                 if picture.mode != "F":
-                    return np.array(picture.convert("RGB"), dtype=np.uint8)
+                    lies = orientation_of(picture) != UPRIGHT
+                    upright = ImageOps.exif_transpose(picture) if lies else picture
+                    return np.array(upright.convert("RGB"), dtype=np.uint8)
                 mode = picture.mode
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise UnreadablePictureError("is damaged or cut off") from error
@@ -144,15 +158,43 @@ def received_as(data: bytes) -> EncodedPicture | None:
     return None
 
 
-def white_of_16(
-    picture: npt.NDArray[np.uint8 | np.int32],  # [H, W, ...] as from read_picture
-) -> int:
-    """The value that is white in 16-bit pictures like this one: 2^12 or 2^16."""
-    return TWELVE_BITS if int(picture.max()) < TWELVE_BITS else 1 << 16
+class WhiteLevel:
+    """White of a recording's pictures of 16 bits: one value for all, or brightness would jump."""
+
+    def __init__(self) -> None:
+        self._white: int | None = None
+        self.sources: dict[str, str] = {}
+        """What is taken as ``white`` and why, once a picture of 16 bits was met."""
+
+    def to_rgb(
+        self,
+        picture: Stored,
+        stated: Callable[[], int | None],
+        whole: Callable[[], Iterator[Stored]],
+    ) -> npt.NDArray[np.uint8]:
+        """[H, W, 3]; the first picture of 16 bits decides: by the white that it has ``stated``,
+        else by the brightest of the ``whole`` recording."""
+        if picture.dtype == np.uint8:
+            return to_rgb(picture, 1)
+        if self._white is None:
+            self._white, self.sources["white"] = _white_of(stated(), whole)
+        return to_rgb(picture, self._white)
+
+
+def _white_of(stated: int | None, whole: Callable[[], Iterator[Stored]]) -> tuple[int, str]:
+    if stated is not None:
+        said = f"white is {stated - 1} in pictures of 16 bits, as their header says"
+        return stated, said
+    assumed = "white is assumed to be {} in pictures of 16 bits: {}"
+    for picture in whole():
+        if picture.dtype != np.uint8 and int(picture.max()) >= TWELVE_BITS:
+            white = 1 << 16
+            return white, assumed.format(white - 1, f"values above {TWELVE_BITS} occur")
+    return TWELVE_BITS, assumed.format(TWELVE_BITS - 1, "none is brighter")
 
 
 def to_rgb(
-    picture: npt.NDArray[np.uint8 | np.int32],  # [H, W] or [H, W, 3]
+    picture: Stored,
     white: int,
 ) -> npt.NDArray[np.uint8]:
     """[H, W, 3] uint8 RGB; 16 bits are scaled so that ``white`` becomes 256."""

@@ -1,4 +1,4 @@
-"""Pictures inside messages of MCAP files and ROS bags, whatever their names: to RGB."""
+"""Pictures inside messages of MCAP files and ROS bags, whatever their names."""
 
 from __future__ import annotations
 
@@ -7,12 +7,7 @@ import re
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.recordings.picture import (
-    UnreadablePictureError,
-    decode_picture,
-    to_rgb,
-    white_of_16,
-)
+from aquaflow.recordings.picture import Stored, UnreadablePictureError, to_rgb
 
 PACKED = re.compile(r"(mono|rgba|rgb|bgra|bgr)(8|16)|(8|16)uc([134])")
 """Channels beside each other, 8 or 16 bits each (sensor_msgs/image_encodings.h); those named by
@@ -28,20 +23,10 @@ PLANES = {"nv12": "NV12", "nv21": "NV21"}
 """4:2:0: luma, then half as many rows of colour."""
 
 
-def compressed_picture(data: bytes) -> npt.NDArray[np.uint8]:
-    """A whole JPEG, PNG or other picture file as [H, W, 3] RGB.
-
-    Raises:
-        UnreadablePictureError: it is damaged.
-    """
-    picture = decode_picture(data)
-    return to_rgb(picture, white_of_16(picture))
-
-
 def raw_picture(
     data: bytes, height: int, width: int, step: int, encoding: str, big_endian: bool = False
-) -> npt.NDArray[np.uint8]:
-    """The pixels of a foxglove.RawImage or a sensor_msgs/Image as [H, W, 3] RGB.
+) -> Stored:
+    """The pixels of a foxglove.RawImage or a sensor_msgs/Image.
 
     ``step`` is the length of a row in bytes; ``big_endian`` the order of 16-bit numbers.
 
@@ -60,7 +45,7 @@ def raw_picture(
             return _from_yuv(rows[:, : 2 * width].reshape(height, width, 2), PAIRS[name])
         if bayer is not None:
             pattern = _numbers(rows, width, int(bayer[2]), big_endian)
-            return _in_eight_bits(_from_bayer(pattern, SECOND_ROW[bayer[1]]))
+            return _as_stored(_from_bayer(pattern, SECOND_ROW[bayer[1]]))
         assert packed is not None
         return _from_packed(rows, width, packed, big_endian)
     except ValueError:
@@ -76,15 +61,15 @@ def _from_packed(
     width: int,
     name: re.Match[str],
     big_endian: bool,
-) -> npt.NDArray[np.uint8]:
-    """[H, W, 3] of what ``PACKED`` matches."""
+) -> Stored:
+    """Of what ``PACKED`` matches."""
     order = name[1] or {"1": "mono", "3": "bgr", "4": "bgra"}[name[4]]
     channels = {"mono": 1, "rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4}[order]
     numbers = _numbers(rows, width * channels, int(name[2] or name[3]), big_endian)
     picture = numbers.reshape(len(rows), width, channels)
     if channels == 1:
-        return _in_eight_bits(picture[..., 0])
-    return _in_eight_bits(picture[..., 2::-1] if order.startswith("bgr") else picture[..., :3])
+        return _as_stored(picture[..., 0])
+    return _as_stored(picture[..., 2::-1] if order.startswith("bgr") else picture[..., :3])
 
 
 def _numbers(
@@ -100,14 +85,12 @@ def _numbers(
     return stored.astype(np.uint16)
 
 
-def _in_eight_bits(
+def _as_stored(
     picture: npt.NDArray[np.uint8 | np.uint16],  # [H, W] or [H, W, 3]
-) -> npt.NDArray[np.uint8]:
-    """[H, W, 3]"""
+) -> Stored:
     if picture.dtype == np.uint8:
-        return to_rgb(picture.astype(np.uint8), 1)
-    wide = picture.astype(np.int32)
-    return to_rgb(wide, white_of_16(wide))
+        return to_rgb(picture.astype(np.uint8, copy=False), 1)
+    return picture.astype(np.int32)
 
 
 def _from_bayer(

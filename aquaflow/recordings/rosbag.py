@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.base.errors import InputError, reason_of
@@ -17,8 +18,12 @@ if TYPE_CHECKING:
 
 ROS_1_SUFFIX, ROS_2_FILE = ".bag", "metadata.yaml"
 """A bag of ROS 1 is a file, one of ROS 2 a folder with this file in it."""
-ROS_2_STORAGE = frozenset({".db3", ".mcap"})
-"""Suffixes of the files next to it that hold the messages."""
+ROS_2_STORAGE = (".db3", ".db3.zstd", ".mcap", ".mcap.zstd")
+"""Endings of the files next to it that hold the messages."""
+DATABASES = (".db3", ".db3.zstd")
+"""Of them those that are bags without that file too: where recording was cut off, or alone."""
+ZSTD, ZSTD_MAGIC = ".zstd", b"\x28\xb5\x2f\xfd"
+"""Ending of a compressed file, and how compressed messages begin (RFC 8878)."""
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 """Messages with a picture."""
@@ -30,11 +35,19 @@ LONGEST_DELAY_NS = 10_000_000_000
 
 
 def is_bag(path: Path) -> bool:
-    """True for a ``.bag`` file, or a folder that ``ros2 bag record`` wrote."""
-    if path.is_dir():
-        stored = any(file.suffix in ROS_2_STORAGE for file in path.iterdir())
-        return (path / ROS_2_FILE).is_file() and stored
-    return path.is_file() and path.suffix.lower() == ROS_1_SUFFIX
+    """True for a ``.bag`` or ``.db3`` file, or a folder that ``ros2 bag record`` wrote."""
+    return bool(_files_of(path))
+
+
+def _files_of(path: Path) -> list[Path]:
+    """What rosbags opens of a bag, in order; nothing of what is none."""
+    if not path.is_dir():
+        known = path.is_file() and path.name.lower().endswith((ROS_1_SUFFIX, *DATABASES))
+        return [path] if known else []
+    names = sorted(file.name for file in path.iterdir())
+    if (path / ROS_2_FILE).is_file():
+        return [path] if any(name.endswith(ROS_2_STORAGE) for name in names) else []
+    return [path / name for name in names if name.endswith(DATABASES)]
 
 
 @contextmanager
@@ -51,17 +64,29 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
         raise InputError(
             f"ROS bags need {error.name}; install it with pip install 'aquaflow[recording]'"
         ) from error
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    except Exception as error:  # of rosbags, YAML, SQLite, MCAP, and each compression
-        raise InputError(
-            f"cannot read the bag {path}: {reason_of(error)}; copy or record it again"
-        ) from error
-    try:
+    with ExitStack() as stack:
+        try:
+            files = [_unpacked(file, stack) for file in _files_of(path)]
+            reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+        except Exception as error:  # of rosbags, YAML, SQLite, MCAP, and each compression
+            raise InputError(
+                f"cannot read the bag {path}: {reason_of(error)}; copy or record it again"
+            ) from error
+        stack.callback(reader.close)
         yield reader
-    finally:
-        reader.close()
+
+
+def _unpacked(file: Path, stack: ExitStack) -> Path:
+    """The file, or what it was before it was compressed, for as long as ``stack`` lasts."""
+    if not file.name.endswith(ZSTD):
+        return file
+    from zstandard import ZstdDecompressor
+
+    plain = Path(stack.enter_context(TemporaryDirectory())) / file.name.removesuffix(ZSTD)
+    with file.open("rb") as packed, plain.open("wb") as unpacked:
+        ZstdDecompressor().copy_stream(packed, unpacked)
+    return plain
 
 
 def messages_in(
@@ -101,10 +126,13 @@ def picture_connections(reader: AnyReader, topic: str | None = None) -> list[Con
 def decode(reader: AnyReader, connection: Connection, data: bytes) -> Any | None:
     """The message with its fields as attributes; None if it is damaged."""
     from rosbags.highlevel import AnyReaderError
+    from zstandard import ZstdDecompressor, ZstdError
 
     try:
+        if data[:4] == ZSTD_MAGIC:  # in a database without the file that says so
+            data = ZstdDecompressor().decompress(data)
         return reader.deserialize(data, connection.msgtype)
-    except (AnyReaderError, ValueError, IndexError, struct.error):
+    except (AnyReaderError, ZstdError, ValueError, IndexError, struct.error):
         return None
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, printable
 from aquaflow.geometry.camera import CameraModel, guess_camera
@@ -18,8 +18,15 @@ from aquaflow.recordings.camera_info import (
     info_topic,
     is_rectified,
 )
-from aquaflow.recordings.picture import UnreadablePictureError, received_as
-from aquaflow.recordings.picture_message import compressed_picture, raw_picture
+from aquaflow.recordings.picture import (
+    Stored,
+    UnreadablePictureError,
+    WhiteLevel,
+    decode_picture,
+    received_as,
+    stated_white,
+)
+from aquaflow.recordings.picture_message import raw_picture
 from aquaflow.recordings.rosbag import (
     COMPRESSED,
     decode,
@@ -32,7 +39,7 @@ from aquaflow.recordings.rosbag import (
     stamp_of,
 )
 from aquaflow.sources import is_asked
-from aquaflow.types import Dropped, EncodedPicture, Frame
+from aquaflow.types import Dropped, Frame
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -67,12 +74,22 @@ class RosbagCamera:
             self.frame_count: int | None = counts[self.topic]
             self.origin_ns = origin_of(reader, self.topic)
             self.camera, said = _calibration(reader, self.topic)
-        self._facts = [said]
+        self._facts, self._white = {"calibration": said}, WhiteLevel()
+        self._damage: list[str] = []
+        if fps is not None:
+            self._facts["times"] = f"--fps is not used: {path.name} has times of its own"
         if others := sorted(set(counts) - {self.topic}):
-            self._facts.append(
-                f"{self.topic} is used; also there: {', '.join(others)} (choose by --topic)"
-            )
-        self.notes = list(self._facts)
+            also = f"also there: {', '.join(others)} (choose by --topic)"
+            self._facts["topic"] = f"{self.topic} is used; {also}"
+
+    def sources(self) -> dict[str, str]:
+        """Of calibration, topic and white."""
+        return self._facts | self._white.sources
+
+    @property
+    def notes(self) -> list[str]:
+        """The sources, and what was left out."""
+        return [*self.sources().values(), *self._damage]
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -95,9 +112,9 @@ class RosbagCamera:
         self, every: int = 1, start: int = 0, stop: int | None = None
     ) -> Iterator[Frame | Dropped]:
         """The pictures ``start, start + every, ...`` below ``stop``, in the order of reception."""
-        self.notes = list(self._facts)
+        self._damage = []
         with open_bag(self.path) as reader:
-            messages = messages_in(reader, picture_connections(reader, self.topic), self.notes)
+            messages = messages_in(reader, picture_connections(reader, self.topic), self._damage)
             for index, (connection, received_ns, data) in enumerate(messages):
                 if stop is not None and index >= stop:
                     return
@@ -112,21 +129,31 @@ class RosbagCamera:
         t_ns = stamp_of(message, received_ns) - self.origin_ns
         arrival_ns = max(received_ns - self.origin_ns, t_ns)
         try:
-            image, encoded = _picture(message, kind)
+            stored, data = _stored(message, kind)
         except UnreadablePictureError as error:
             return Dropped(index, t_ns, f"{self.name_of(index)} {error}")
+        image = self._white.to_rgb(stored, lambda: stated_white(data), self._whole)
+        encoded = received_as(data) if kind == COMPRESSED and stored.dtype == np.uint8 else None
         camera = self.camera or guess_camera(image.shape[1], image.shape[0])
         return Frame(index, t_ns, arrival_ns, image, camera, encoded=encoded)
 
+    def _whole(self) -> Iterator[Stored]:
+        with open_bag(self.path) as reader:
+            connections = picture_connections(reader, self.topic)
+            for connection, _, data in messages_in(reader, connections, []):
+                with suppress(UnreadablePictureError):
+                    yield _stored(decode(reader, connection, data), connection.msgtype)[0]
 
-def _picture(message: Any, kind: str) -> tuple[npt.NDArray[np.uint8], EncodedPicture | None]:
+
+def _stored(message: Any, kind: str) -> tuple[Stored, bytes]:
+    """The picture, and the bytes of its file."""
     if message is None:
         raise UnreadablePictureError("is damaged")
     data = bytes(message.data)
     if kind == COMPRESSED:
-        return compressed_picture(data), received_as(data)
+        return decode_picture(data), data
     shape = (message.height, message.width, message.step)
-    return raw_picture(data, *shape, message.encoding, bool(message.is_bigendian)), None
+    return raw_picture(data, *shape, message.encoding, bool(message.is_bigendian)), data
 
 
 def _calibration(reader: AnyReader, topic: str) -> tuple[CameraModel | None, str]:

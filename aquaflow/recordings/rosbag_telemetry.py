@@ -52,6 +52,7 @@ class RosbagTelemetry:
         self.path = path
         self.notes: list[str] = []
         self._shift_ns = round(starts_s * 1e9)
+        self._topic: str | None = None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -60,6 +61,10 @@ class RosbagTelemetry:
     @classmethod
     def open(cls, path: Path, starts_s: float = 0.0) -> RosbagTelemetry:
         return cls(path, starts_s)
+
+    def follow(self, fps: float | None, topic: str | None) -> None:
+        """Times count from the first picture of ``topic``."""
+        self._topic = topic
 
     def samples(self) -> Iterator[TelemetrySample]:
         """Samples in the order of reception; messages of impossible values cost themselves.
@@ -70,7 +75,7 @@ class RosbagTelemetry:
         bad = 0
         self.notes = []
         with open_bag(self.path) as reader:
-            base_ns = origin_of(reader) - self._shift_ns
+            base_ns = origin_of(reader, self._topic) - self._shift_ns
             utc = LoggedUtc(f"{self.path.stem}/bag", iter([(0, base_ns)]))
             wanted = [c for c in reader.connections if c.msgtype in CONVERSIONS]
             for connection, received_ns, data in messages_in(reader, wanted, self.notes):

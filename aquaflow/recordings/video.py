@@ -24,6 +24,8 @@ EXTENSIONS = frozenset({
 })  # fmt: skip
 """Of files in containers that FFmpeg reads and cameras write."""
 
+BARE = frozenset({".h264", ".264", ".h265", ".hevc", ".mjpeg", ".mjpg"})
+"""Of streams without a container: they hold no times, and FFmpeg takes 25 a second for them."""
 COUNT_TOLERANCE = 1
 """Some containers give a duration instead of a count; one frame less is not a cut-off video."""
 CHAPTERS = (
@@ -31,6 +33,13 @@ CHAPTERS = (
     (re.compile(r"(G)OPR(\d{4})(\.\w+)", re.IGNORECASE), "{0}P{chapter:02d}{1}{2}", 1),
 )
 """First file of a GoPro recording, the names of its others, and the number of the second one."""
+
+SENSORS = {b"gpmd": "GoPro", b"djmd": "DJI", b"camm": "Google", b"rtmd": "Sony"}
+"""Formats of streams in MP4 with what a camera's sensors measured, and whose they are."""
+FORMAT = re.compile(rb"stsd.{12}(.{4})", re.DOTALL)
+"""A stream's format in the index of an MP4 (ISO 14496-12, 8.5.2)."""
+LARGEST_INDEX = 1 << 26
+"""Bytes; that of ten hours has as many."""
 
 
 class VideoFile:
@@ -52,17 +61,21 @@ class VideoFile:
         """
         self.path = path
         self.files = _chapters(path)
-        self._read_notes: list[str] = []
+        self._facts: dict[str, str] = {}
         with VideoDecoder(path) as decoder:
             self.width, self.height = decoder.width, decoder.height
             rate, pixel, first = decoder.rate, decoder.pixel_width, decoder.frame_count
         counts = [first, *(_frame_count(file) for file in self.files[1:])]
         self.frame_count: int | None = sum(counts) if all(counts) else None
-        self._note_rate(rate, fps)
+        self._is_bare = path.suffix.lower() in BARE
+        self._timed_by_fps = self._is_bare and fps is not None
         known = rate if rate > 0.0 else DEFAULT_FPS
+        self._note_rate(rate, known, fps)
         self._period_ns = NS_PER_S / (known if fps is None else fps)
         self.camera = self._sidecar_calibration(pixel)
-        self.notes: list[str] = list(self._read_notes)
+        if unread := [SENSORS[each] for each in _formats(path) if each in SENSORS]:
+            self._facts["sensors"] = f"what the sensors measured is not read: {', '.join(unread)}"
+        self._damage: list[str] = []
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -71,6 +84,15 @@ class VideoFile:
     @classmethod
     def open(cls, path: Path, fps: float | None = None) -> VideoFile:
         return cls(path, fps)
+
+    def sources(self) -> dict[str, str]:
+        """Of times, files, pixels and calibration."""
+        return dict(self._facts)
+
+    @property
+    def notes(self) -> list[str]:
+        """The sources, and what was left out."""
+        return [*self._facts.values(), *self._damage]
 
     def name_of(self, index: int) -> str:
         """The video's name and the frame's number, ``clip.mp4#12``."""
@@ -84,7 +106,7 @@ class VideoFile:
         Seeking is left out on purpose: it is inexact in many containers, and times would differ
         from those of a full pass.
         """
-        self.notes = list(self._read_notes)
+        self._damage = []
         clock, index, begins_ms, doubtful = _Clock(self._period_ns), 0, 0.0, 0
         for file in self.files:
             with VideoDecoder(file) as decoder:
@@ -93,6 +115,8 @@ class VideoFile:
                     if not decoder.grab():
                         break
                     position_ms = decoder.position_ms
+                    if self._timed_by_fps:
+                        position_ms = 1e-6 * self._period_ns * index
                     t_ns = clock.tick(begins_ms + position_ms)
                     if is_asked(index, every, start):
                         frame = self._frame(decoder, index, t_ns)
@@ -104,12 +128,12 @@ class VideoFile:
         if stop is None or index < stop:
             self._note_early_end(index)
         if doubtful:
-            self.notes.append(
+            self._damage.append(
                 f"{doubtful} frames of {self.path.name} were left out because they cannot be "
                 "decoded without errors"
             )
         if clock.repaired:
-            self.notes.append(
+            self._damage.append(
                 f"{clock.repaired} frame times of {self.path.name} do not increase; they were "
                 "set from the frame rate"
             )
@@ -130,33 +154,32 @@ class VideoFile:
         camera = self.camera or guess_camera(self.width, self.height)
         return Frame(index, t_ns, t_ns, np.asarray(image, np.uint8), camera)
 
-    def _note_rate(self, rate: float, fps: float | None) -> None:
-        if rate > 0.0:
-            note = f"rate: {rate:.6g} pictures a second, from the container"
+    def _note_rate(self, rate: float, known: float, fps: float | None) -> None:
+        if rate > 0.0 and not self._is_bare:
+            unused = "" if fps is None else "; --fps is not used"
+            note = f"rate: {rate:.6g} pictures a second, from the container{unused}"
         elif fps is not None:
             note = f"rate: {fps:g} pictures a second, from --fps"
         else:
-            note = (
-                f"rate: {DEFAULT_FPS:g} pictures a second was assumed, because the container "
-                "states none; give --fps"
-            )
-        self._read_notes.append(note)
+            why = "there is no container" if self._is_bare else "the container states none"
+            note = f"rate: {known:.6g} pictures a second was assumed, because {why}; give --fps"
+        self._facts["times"] = note
         if len(self.files) > 1:
             names = ", ".join(file.name for file in self.files)
-            self._read_notes.append(f"chapters of one recording: {names}")
+            self._facts["files"] = f"chapters of one recording: {names}"
 
     def _note_decoding(self, decoder: VideoDecoder) -> None:
         if decoder.deinterlaced_from is not None:
-            self.notes.append(
+            self._damage.append(
                 f"{decoder.path.name} is interlaced from frame {decoder.deinterlaced_from} on; "
                 "FFmpeg decodes and deinterlaces it"
             )
         if decoder.complaint:
-            self.notes.append(f"the first error in {decoder.path.name}: {decoder.complaint}")
+            self._damage.append(f"the first error in {decoder.path.name}: {decoder.complaint}")
 
     def _note_early_end(self, read: int) -> None:
         if self.frame_count is not None and read < self.frame_count - COUNT_TOLERANCE:
-            self.notes.append(f"the video ends after {read} of {self.frame_count} frames")
+            self._damage.append(f"the video ends after {read} of {self.frame_count} frames")
 
     def _sidecar_calibration(self, pixel: float) -> CameraModel | None:
         """The ``camera.yaml`` in the video's folder, if it is for pictures of this shape.
@@ -167,21 +190,20 @@ class VideoFile:
         file = self.path.parent / CALIBRATION
         camera = load_camera(file) if file.is_file() else None
         if camera is not None and _is_shape_of(camera, self.width, self.height):
-            self._read_notes.append(f"the calibration is {file}")
+            self._facts["calibration"] = f"the calibration is {file}"
             return camera
         stored = f"{self.width} x {self.height}"
         if pixel != 1.0:
             self.width = round(self.width * pixel)
             what = f"{pixel:.4g} wide and 1 high; pictures of {stored} are stretched to"
-            self._read_notes.append(
-                f"pixels: {what} {self.width} x {self.height}, from the container"
-            )
+            stretched = f"{what} {self.width} x {self.height}, from the container"
+            self._facts["pixels"] = f"pixels: {stretched}"
         if camera is None:
             return None
         if _is_shape_of(camera, self.width, self.height):
-            self._read_notes.append(f"the calibration is {file}")
+            self._facts["calibration"] = f"the calibration is {file}"
             return camera
-        self._read_notes.append(
+        self._facts["calibration"] = (
             f"{file} is not used: it is for pictures of {camera.width} x {camera.height}, those of "
             f"{self.path.name} are {stored}"
         )
@@ -204,6 +226,21 @@ def _chapters(path: Path) -> list[Path]:
             )
             files += takewhile(Path.is_file, others)
     return files
+
+
+def _formats(path: Path) -> list[bytes]:
+    """Of the streams of an MP4; none for other files, and for one that is damaged."""
+    with path.open("rb") as file:
+        while len(head := file.read(8)) == 8:
+            size, kind = int.from_bytes(head[:4], "big"), head[4:]
+            if kind == b"moov":
+                return FORMAT.findall(file.read(min(size, LARGEST_INDEX)))
+            if size == 1:  # a long box says its size in the next 8 bytes
+                size = int.from_bytes(file.read(8), "big") - 8
+            if size < 8 or not kind.isalnum():
+                break
+            file.seek(size - 8, 1)
+    return []
 
 
 def _frame_count(path: Path) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -14,17 +13,18 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import Self
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable
 from aquaflow.recordings.decoder_log import DecoderLog
 from aquaflow.recordings.picture import UnreadablePictureError
-
-# OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 REFUSED = "Cannot convert interlaced to progressive"
 """FFmpeg's scaler to OpenCV, which then returns the picture before as this one."""
 REORDERED = 2
 """Pictures that a codec shows before one that it decoded earlier: H.264 of cameras has 0 to 2."""
+LONGEST_DOUBT = 60
+"""Pictures: cameras send a whole one every 1 to 2 s, or renew all parts in that time."""
+PREDICTED = frozenset({ord("P"), ord("B")})
+"""Types of pictures that are made from others."""
 FFMPEG = "ffmpeg"
 DEINTERLACE = "idet=prog_thres=1.05:intl_thres=1.04,bwdif=mode=send_frame:deint=interlaced"
 """What only says that it is interlaced stays as it is; what is gets one picture a frame.
@@ -38,8 +38,9 @@ class VideoDecoder:
     """Pictures in order, each after :meth:`grab`; silent on stderr.
 
     A picture that the decoder complained about is none. A codec shows pictures in another order
-    than it decodes, so the ``REORDERED`` pictures after a complaint are none either. Interlaced
-    pictures, which OpenCV cannot convert, come from the program ``ffmpeg``, where it is installed.
+    than it decodes, so the ``REORDERED`` pictures after a complaint are none either, nor are those
+    predicted from them, up to the next whole one. Interlaced pictures, which OpenCV cannot convert,
+    come from the program ``ffmpeg``, where it is installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -48,7 +49,7 @@ class VideoDecoder:
         """The first one."""
         self.deinterlaced_from: int | None = None
         """The first picture that OpenCV could not convert."""
-        self._index, self._doubtful_until = -1, -1
+        self._index, self._doubtful_until, self._doubted_from = -1, -1, 0
         self._reason = ""
         self._ffmpeg: subprocess.Popen[bytes] | None = None
         self._from_ffmpeg = 0
@@ -66,9 +67,10 @@ class VideoDecoder:
         self._log = self._stack.enter_context(DecoderLog())
         try:
             if not self._capture.isOpened() or not self._capture.grab():
+                said = "".join(f": {complaint}" for complaint in self._log.complaints()[:1])
                 raise InputError(
-                    f"{self.path} cannot be read as a video; check that it plays, or give a folder "
-                    "of images"
+                    f"{self.path} cannot be read as a video{printable(said)}; check that it plays, "
+                    "convert it to H.264, or give a folder of images"
                 )
             self.width = int(self._property(cv2.CAP_PROP_FRAME_WIDTH))
             self.height = int(self._property(cv2.CAP_PROP_FRAME_HEIGHT))
@@ -103,10 +105,12 @@ class VideoDecoder:
         complaints = self._log.complaints()
         if grabbed and complaints and not self._one_thread:
             # Threads decode ahead, so that a complaint belongs to a later picture.
-            complaints = self._decode_in_one_thread()
+            complaints = self._decode_in_one_thread(self._index + 1)
         self._index += 1
         if grabbed and complaints:
             self._doubt(complaints)
+        elif grabbed and self._is_predicted_from_damage():
+            self._doubtful_until = self._index
         return grabbed
 
     def picture(self) -> npt.NDArray[np.uint8]:
@@ -123,22 +127,40 @@ class VideoDecoder:
             if decoded and not complaints:
                 return np.asarray(bgr, np.uint8)
             if not any(REFUSED in complaint for complaint in complaints):
-                self.complaint = self.complaint or "; ".join(complaints[:1])
-                raise UnreadablePictureError("cannot be decoded")
+                return self._picture_again(complaints)
             self.deinterlaced_from = self._index
         return self._read_deinterlaced()
 
+    def _picture_again(self, complaints: list[str]) -> npt.NDArray[np.uint8]:
+        """By one thread, as others decode ahead and may have complained about a later picture."""
+        if not self._one_thread:
+            complaints = self._decode_in_one_thread(self._index)
+            if complaints:
+                self._doubt(complaints)
+            return self.picture()
+        self.complaint = self.complaint or "; ".join(complaints[:1])
+        raise UnreadablePictureError("cannot be decoded")
+
+    def _is_predicted_from_damage(self) -> bool:
+        import cv2
+
+        if not 0 <= self._index - 1 == self._doubtful_until < self._doubted_from + LONGEST_DOUBT:
+            return False
+        return int(self._property(cv2.CAP_PROP_FRAME_TYPE)) in PREDICTED
+
     def _doubt(self, complaints: Sequence[str]) -> None:
+        if self._index > self._doubtful_until:
+            self._doubted_from = self._index
         self._doubtful_until = self._index + REORDERED
         self._reason = complaints[-1]
         self.complaint = self.complaint or complaints[0]
 
-    def _decode_in_one_thread(self) -> list[str]:
-        """Open again, and decode up to the picture just grabbed; the complaints about it."""
+    def _decode_in_one_thread(self, index: int) -> list[str]:
+        """Open again, and decode up to a picture; the complaints about it."""
         self._capture.release()
         self._capture = _open_capture(self.path, threads=1)
         self._one_thread = True
-        for _ in range(self._index + 1):
+        for _ in range(index):
             self._capture.grab()
         self._log.complaints()
         self._capture.grab()

@@ -36,8 +36,12 @@ class CameraSource(Protocol):
     """Calibration that comes with the recording, if any."""
     frame_count: int | None
     """Number of frames, where the source knows it."""
-    notes: list[str]
-    """Sentences for the user about what was left out, complete once iteration ends."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences for the user about what was read, assumed and left out, complete once
+        iteration ends."""
+        ...
 
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None
@@ -166,6 +170,30 @@ class RecordedTelemetry(TelemetrySource, Protocol):
         ...
 
 
+@runtime_checkable
+class StatesSources(Protocol):
+    """A recorded camera that says where what it reads comes from, and what it assumes."""
+
+    def sources(self) -> dict[str, str]:
+        """A sentence on each of ``times``, ``calibration``, ``white``, ``pixels``, ``topic`` and
+        so on, as far as there is something to say; ``notes`` holds them too."""
+        ...
+
+
+def sources_of(camera: object) -> dict[str, str]:
+    """What a camera states of its sources, if it is one that can."""
+    return camera.sources() if isinstance(camera, StatesSources) else {}
+
+
+@runtime_checkable
+class FollowsPictures(Protocol):
+    """Recorded telemetry whose clock begins with the first picture of its own recording."""
+
+    def follow(self, fps: float | None, topic: str | None) -> None:
+        """Which pictures those are, as of :func:`open_recording`."""
+        ...
+
+
 def open_recording(
     path: Path, fps: float | None = None, topic: str | None = None
 ) -> RecordedCamera:
@@ -178,6 +206,8 @@ def open_recording(
     if not path.exists():
         raise InputError(f"there is nothing at {path}; give a folder of images or a video file")
     reader = camera_reader(path)
+    if topic is not None and fps is not None:
+        raise InputError(f"{path} has times of its own on {topic}; leave out --fps")
     if reader is not None and topic is not None:
         if not isinstance(reader, TopicReader):
             raise InputError(f"{path} has no topics; leave out --topic")

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import islice
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config import SourceConfig
+from aquaflow.sources import CameraSource
+from aquaflow.types import Frame
+
+Grey: TypeAlias = npt.NDArray[np.float32]
+"""[H, W] green of every few pixels."""
+GREEN = 1
+"""Channel that water lets through."""
+FIRST = 10
+"""Pictures that are looked at before a recording is mapped: 0.1 s of a film's decoding."""
 STEP = 8
 """Every 8th pixel of every 8th row is looked at."""
 FLAT = 1.0
@@ -22,46 +33,88 @@ MOST_SHARE = 0.5
 """Share of the pictures from which on something is said of them."""
 
 
+class PictureCheck:
+    """What is odd about pictures that follow each other; each is looked at once and forgotten."""
+
+    def __init__(self) -> None:
+        self._count = self._dark = self._bright = self._flat = self._repeated = self._cuts = 0
+        self._first: Grey | None = None
+        self._last: Grey | None = None
+        self._whole = np.empty((0, 0, 3), np.uint8)
+        """The last picture, for the few that equal it where it is looked at."""
+        self._moved = 0.0
+        """Mean difference to the first picture, the largest."""
+
+    def add(
+        self,
+        picture: npt.NDArray[np.uint8],  # [H, W, 3]
+    ) -> None:
+        """The next picture; one of another size than the first is not looked at."""
+        grey = picture[::STEP, ::STEP, GREEN].astype(np.float32)
+        if self._first is None or self._last is None:
+            self._first = self._last = grey
+        if grey.shape != self._first.shape:
+            return
+        mean = float(grey.mean())
+        self._count += 1
+        self._dark += mean < DARK
+        self._bright += mean > BRIGHT
+        self._flat += float(grey.std()) < FLAT
+        if self._count > 1:
+            same = np.array_equal(grey, self._last)
+            self._repeated += same and np.array_equal(picture, self._whole)
+            self._cuts += _correlation(self._last, grey) < CUT
+            self._moved = max(self._moved, float(np.abs(grey - self._first).mean()))
+        self._last, self._whole = grey, picture
+
+    def blank(self) -> list[str]:
+        """Clauses on pictures without a scene."""
+        return [
+            f"{number} of {self._count} pictures are {words}"
+            for number, words in (
+                (self._dark, "nearly black"),
+                (self._bright, "nearly white"),
+                (self._flat, "of one colour"),
+            )
+            if number > MOST_SHARE * self._count
+        ]
+
+    def oddities(self) -> list[str]:
+        """Clauses on the pictures so far; none for usual ones."""
+        count, said = self._count, self.blank()
+        if self._flat > MOST_SHARE * count or count < 2:
+            return said
+        if self._moved < STILL:
+            said.append("nothing moves: all pictures show the same")
+        elif self._repeated > MOST_SHARE * (count - 1):
+            said.append(f"{self._repeated} of {count} pictures repeat the one before")
+        if 0 < self._cuts <= MOST_SHARE * (count - 1):  # stills of a survey are all unlike
+            said.append(f"the scene changes from one picture to the next {self._cuts} times")
+        return said
+
+
+def blank_at_first(camera: CameraSource, source: SourceConfig) -> list[str]:
+    """Clauses on the first pictures that would be mapped, if they show no scene: whether anything
+    moves is too early to say."""
+    check = PictureCheck()
+    frames = camera.frames(source.every, source.start, source.stop)
+    for frame in islice(frames, FIRST):
+        if isinstance(frame, Frame):
+            check.add(frame.image)
+    return check.blank()
+
+
 def oddities(
     pictures: Sequence[npt.NDArray[np.uint8]],  # [H, W, 3] each
-    step: int = STEP,
 ) -> list[str]:
-    """Clauses on pictures [H, W, 3] that follow each other; none for usual ones. Every ``step``-th
-    pixel is looked at."""
-    if not pictures:
-        return []
-    small = [
-        picture[::step, ::step].mean(axis=2)
-        for picture in pictures
-        if picture.shape == pictures[0].shape
-    ]
-    count, said = len(small), []
-    flat = sum(float(grey.std()) < FLAT for grey in small)
-    for number, words in (
-        (sum(float(grey.mean()) < DARK for grey in small), "nearly black"),
-        (sum(float(grey.mean()) > BRIGHT for grey in small), "nearly white"),
-        (flat, "of one colour"),
-    ):
-        if number > MOST_SHARE * count:
-            said.append(f"{number} of {count} pictures are {words}")
-    if flat > MOST_SHARE * count or count < 2:
-        return said
-    pairs = list(pairwise(small))
-    repeated = sum(np.array_equal(a, b) for a, b in pairwise(pictures))
-    if max(float(np.abs(grey - small[0]).mean()) for grey in small) < STILL:
-        said.append("nothing moves: all pictures show the same")
-    elif repeated > MOST_SHARE * len(pairs):
-        said.append(f"{repeated} of {count} pictures repeat the one before")
-    cuts = sum(_correlation(a, b) < CUT for a, b in pairs)
-    if 0 < cuts <= MOST_SHARE * len(pairs):  # stills of a survey are all unlike
-        said.append(f"the scene changes from one picture to the next {cuts} times")
-    return said
+    """Clauses on pictures that follow each other; none for usual ones."""
+    check = PictureCheck()
+    for picture in pictures:
+        check.add(picture)
+    return check.oddities()
 
 
-def _correlation(
-    a: npt.NDArray[np.float64],  # [H, W]
-    b: npt.NDArray[np.float64],  # [H, W]
-) -> float:
-    if a.std() < FLAT or b.std() < FLAT:
-        return 1.0
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+def _correlation(a: Grey, b: Grey) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    spread = float(np.sqrt((a * a).mean() * (b * b).mean()))
+    return 1.0 if spread < FLAT * FLAT else float((a * b).mean()) / spread

@@ -7,7 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.sources import RecordedTelemetry, open_recorded_telemetry, telemetry_reader
+from aquaflow.sources import (
+    FollowsPictures,
+    RecordedTelemetry,
+    open_recorded_telemetry,
+    telemetry_reader,
+)
 
 
 @dataclass(frozen=True)
@@ -35,12 +40,16 @@ class TelemetryInput:
 
 
 def open_telemetry(
-    recording: Path | None, logs: Sequence[Path] = (), offset_s: float | None = None
+    recording: Path | None,
+    logs: Sequence[Path] = (),
+    offset_s: float | None = None,
+    fps: float | None = None,
+    topic: str | None = None,
 ) -> TelemetryInput:
     """The telemetry that the recording brings itself, if it lies on disk, and ``logs`` beside it.
 
     ``offset_s`` is when every log begins, in seconds after the recording's first picture; None if
-    that is not known.
+    that is not known. ``fps`` and ``topic`` are those by which the recording was opened.
 
     Raises:
         InputError: a log is missing, no installed source finds telemetry in it, or an offset was
@@ -50,6 +59,9 @@ def open_telemetry(
         raise InputError("--telemetry-offset says when a log begins; give the log by --telemetry")
     reader = None if recording is None else telemetry_reader(recording)
     own = [] if reader is None or recording is None else [reader.open(recording)]
+    for each in own:
+        if isinstance(each, FollowsPictures):
+            each.follow(fps, topic)
     if offset_s is not None:
         opened = [open_recorded_telemetry(log, offset_s) for log in logs]
         return TelemetryInput(synchronised=[*own, *opened])

@@ -12,10 +12,14 @@ import pytest
 
 from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.recordings import video_decoder
+from aquaflow.recordings.h264 import decode_units
 from aquaflow.recordings.video import VideoFile
 from aquaflow.types import Dropped, Frame
+from tests.recordings.inputs.films import film
 
 SIDE, COUNT, FPS = 96, 12, 20.0
+LEAST_DEINTERLACED_DB = 40.0
+"""PSNR of a deinterlaced picture, measured 42.2; woven as they are the fields have 28.5."""
 NEAR = 4.0
 """Grey levels that two encodings of one picture differ by at most, on average."""
 
@@ -73,15 +77,7 @@ def read(path: Path) -> tuple[VideoFile, list[Frame | Dropped]]:
 @pytest.mark.parametrize(
     ("name", "code"),
     [
-        ("clip.mts", "MPG2"),
         ("clip.M2TS", "MPG2"),
-        ("clip.mpeg", "MPG2"),
-        ("clip.ts", "MPG2"),
-        ("clip.vob", "MPG2"),
-        ("clip.mkv", "FFV1"),
-        ("clip.mov", "mp4v"),
-        ("clip.3gp", "mp4v"),
-        ("clip.wmv", "WMV2"),
         ("clip.mjpeg", "MJPG"),
         ("10:30:00.avi", "MJPG"),
     ],
@@ -90,7 +86,7 @@ def test_containers_give_the_same_pictures_and_their_rate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, code: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    plain = tmp_path / f"plain{Path(name).suffix.replace('.mts', '.ts').replace('.M2TS', '.ts')}"
+    plain = tmp_path / f"plain{Path(name).suffix.replace('.M2TS', '.ts')}"
     write(plain, code).rename(name)
     assert VideoFile.recognises(Path(name))
     source, frames = read(Path(name))
@@ -146,7 +142,7 @@ def test_pictures_that_the_decoder_complains_about_are_counted_and_named(
     lost = [frame.index for frame in frames if isinstance(frame, Dropped)]
     assert len(frames) == COUNT
     assert 6 in lost
-    assert len(lost) <= 1 + video_decoder.REORDERED
+    assert lost == list(range(lost[0], COUNT)), "all after it are made from it"
     assert all("is damaged: " in frame.reason for frame in frames if isinstance(frame, Dropped))
     assert any(f"{len(lost)} frames of clip.m2v were left out" in note for note in source.notes)
     assert any(note.startswith("the first error in clip.m2v: ") for note in source.notes)
@@ -194,3 +190,35 @@ def test_chapters_of_a_gopro_are_one_recording(tmp_path: Path, names: tuple[str,
         assert isinstance(frame, Frame)
         assert difference(frame, bgr) < NEAR, frame.index
     assert f"chapters of one recording: {', '.join(names)}" in source.notes
+
+
+@needs_ffmpeg
+def test_units_made_from_a_damaged_one_are_none_up_to_the_next_whole_one(tmp_path: Path) -> None:
+    options = ("-pix_fmt", "yuv420p", "-bf", "0", "-x264-params", "aud=1:keyint=5:scenecut=0")
+    stream = film(tmp_path / "a.h264", pictures(), "libx264", *options).read_bytes()
+    mark = b"\x00\x00\x00\x01\x09"  # an access unit delimiter (H.264, 7.3.2.4)
+    units = [mark + part for part in stream.split(mark)[1:]]
+    size, rng = len(units[6]), np.random.default_rng(0)
+    units[6] = units[6][: size // 3] + rng.bytes(size - size // 3)
+    decoded = list(decode_units(iter(enumerate(units))))
+    assert [label for label, _ in decoded] == list(range(COUNT))
+    assert [label for label, picture in decoded if picture is None] == [6, 7, 8, 9]
+
+
+@needs_ffmpeg
+def test_fields_of_two_moments_become_the_pictures_of_the_first(tmp_path: Path) -> None:
+    """50 fields a second: lines of the second field are 2 px ahead of those of the first."""
+    whole = pictures()
+    woven = [each.copy() for each in whole[:-1]]
+    for each, later in zip(woven, whole[1:], strict=True):
+        each[1::2] = later[1::2]
+    options = ("-pix_fmt", "yuv420p", "-flags", "+ildct+ilme", "-x264-params", "tff=1")
+    _, frames = read(film(tmp_path / "a.mts", woven, "libx264", *options))
+    found = [frame.image for frame in frames if isinstance(frame, Frame)]
+    assert len(found) == len(woven)
+    decibels = [psnr(a, b) for a, b in zip(found, whole[:-1], strict=True)]
+    assert min(decibels) > LEAST_DEINTERLACED_DB
+
+
+def psnr(a: Picture, b: Picture) -> float:
+    return float(-10.0 * np.log10(np.mean((a.astype(float) - b) ** 2) / 255.0**2))

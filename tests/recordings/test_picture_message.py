@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.recordings.picture import UnreadablePictureError
+from aquaflow.recordings.picture import UnreadablePictureError, to_rgb
 from aquaflow.recordings.picture_message import raw_picture
 
 H, W = 24, 32
@@ -61,7 +61,8 @@ def stored(name: str, wide: str = "<u2") -> npt.NDArray[np.generic]:
 )
 def test_every_encoding_gives_the_same_picture(name: str) -> None:
     data = stored(name)
-    found = raw_picture(data.tobytes(), H, W, data.shape[1] * data[0, 0].nbytes, name)
+    step = data.shape[1] * data[0, 0].nbytes
+    found = to_rgb(raw_picture(data.tobytes(), H, W, step, name), 1 << 16)
     assert found.shape == (H, W, 3)
     inner = np.s_[4:-4, [*range(4, W // 2 - 4), *range(W // 2 + 4, W - 4)]]
     assert np.abs(found[inner].astype(int) - picture()[inner]).max() <= NEAR
@@ -77,7 +78,7 @@ def test_the_order_of_bytes_is_that_of_the_message(name: str) -> None:
     little = raw_picture(small[0].tobytes(), H, W, step, name)
     big = raw_picture(small[1].tobytes(), H, W, step, name, big_endian=True)
     np.testing.assert_array_equal(little, big)
-    assert little[H // 2, 4, 0] == 200
+    assert to_rgb(little, 1 << 16)[H // 2, 4, 0] == 200
 
 
 @pytest.mark.parametrize(("name", "words"), [("jade12", "encoding 'jade12'"), ("rgb8", "fewer")])

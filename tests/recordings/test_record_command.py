@@ -75,7 +75,7 @@ def test_systemds_sigterm_ends_it_cleanly_with_one_line(source: Path, tmp_path: 
     (line,) = printed.splitlines()
     assert line.startswith("Recorded ")
     assert str(out) in line
-    assert McapMessages(mcap_files(out)).counts() is not None
+    assert McapMessages(mcap_files(out)).counts is not None
 
 
 def test_nothing_to_record_is_said(aquaflow: Cli, tmp_path: Path) -> None:

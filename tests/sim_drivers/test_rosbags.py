@@ -12,7 +12,6 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import RecordingConfig
@@ -32,35 +31,12 @@ from aquaflow.types import (
     UtcTime,
     Velocity,
 )
+from tests.recordings.inputs.bags import Messages
 
 SECOND = 1_000_000_000
 BEGAN_NS = 1_700_000_000 * SECOND
 LATE_NS = 20_000_000
 KINDS = ("ros1", "ros2", "ros2mcap")
-
-
-class Messages:
-    """Messages of either generation of ROS."""
-
-    def __init__(self, ros1: bool) -> None:
-        self.ros1 = ros1
-        self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-
-    def make(self, name: str, *values: Any) -> Any:
-        return self.store.types[name](*values)
-
-    def header(self, t_ns: int) -> Any:
-        stamp = self.make("builtin_interfaces/msg/Time", t_ns // SECOND, t_ns % SECOND)
-        values = (0, stamp, "f") if self.ros1 else (stamp, "f")
-        return self.make("std_msgs/msg/Header", *values)
-
-    def vector(self, *xyz: float) -> Any:
-        return self.make("geometry_msgs/msg/Vector3", *xyz)
-
-    def serialized(self, message: Any) -> bytes:
-        name = message.__msgtype__
-        write = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
-        return bytes(write(message, name))
 
 
 def dive(messages: Messages) -> Iterator[tuple[str, int, Any]]:

@@ -52,7 +52,7 @@ def map_one(asked: dict[str, Any]) -> dict[str, Any]:
     source = Path(asked["source"])
     calibration = None if asked["calibration"] is None else load_camera(Path(asked["calibration"]))
     recording = open_recording(source, fps=settings.source.fps)
-    given = open_telemetry(source)
+    given = open_telemetry(source, fps=settings.source.fps)
     from aquaflow.dive.replay import map_recording  # loads torch
 
     finished = map_recording(

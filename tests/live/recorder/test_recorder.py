@@ -293,7 +293,7 @@ def test_recording_stops_before_the_disk_is_full_and_says_so(tmp_path: Path) -> 
     assert status.stopped is not None
     assert "900 MB left" in status.stopped
     # The file is whole: it has its index.
-    assert McapMessages(mcap_files(tmp_path)).counts() is not None
+    assert McapMessages(mcap_files(tmp_path)).counts is not None
     assert not list(McapCamera(tmp_path).notes)
 
 
