@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import yaml
 
 from tests.command_line import Cli
+from tests.drivers.simulated_links import until
 
 ABSENT = "http://127.0.0.1:1/video"
 """Nothing listens on port 1."""
@@ -22,7 +25,14 @@ def test_a_camera_that_is_not_there_is_told_on_stderr_and_in_the_log(
     }
     (tmp_path / "vehicle.yaml").write_text(yaml.safe_dump(settings))
     dive = tmp_path / "dive"
-    ran = aquaflow("run", "--config", tmp_path / "vehicle.yaml", "--out", dive, "--seconds", 1)
+    log = dive / "log.jsonl"
+
+    def stop_when_told(process_id: int) -> None:
+        until(lambda: log.exists() and ABSENT in log.read_text())
+        os.kill(process_id, signal.SIGINT)
+
+    words = ("run", "--config", tmp_path / "vehicle.yaml", "--out", dive)
+    ran = aquaflow(*words, meanwhile=stop_when_told)
     told = f"camera 'front' is waited for: no video from {ABSENT}"
     assert ran.err.splitlines() == [told]
     lines = [json.loads(line) for line in (dive / "log.jsonl").read_text().splitlines()]

@@ -124,7 +124,7 @@ def test_what_is_broken_is_one_sentence(
 def test_no_more_than_a_few_seconds_are_read(
     command: Cli, dive: Dive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(import_module("aquaflow.cli.inspect"), "MOST_FRAMES", 4)
+    monkeypatch.setattr(import_module("aquaflow.cli.doctor"), "MOST_FRAMES", 4)
     folder = write_plainly(tmp_path / "plain", made(dive, tmp_path), dive.camera)
     read: list[int] = []
     one = ImageFolder._frame

@@ -28,7 +28,7 @@ from tests.mapping.mapping_scenes import (
 )
 from tests.pretended_device import PRETENDED
 
-KERNELS = ("photometric", "view_loss", "water", "adam", "activation")
+KERNELS = ("photometric", "water", "adam", "contract")
 FITTED = tuple(f"aquaflow.render.{name}" for name in KERNELS)
 DECODE = "aquaflow.mapping.neural.decoder"
 """Modules that take the compiled kernels where there are any."""

@@ -60,7 +60,7 @@ def _mapper(seed: int) -> tuple[Mapper, View]:
     return mapper, mapper.views[0]
 
 
-@case("gaussians", "mapping.optimisation.map_optimiser.is_number")
+@case("gaussians", "mapping.optimisation.is_number")
 def nan_in_range_input(check: Check, seed: int) -> None:
     """A range that is no number costs the step: the map stays, and the step is counted."""
     mapper, view = _mapper(seed)
@@ -73,7 +73,7 @@ def nan_in_range_input(check: Check, seed: int) -> None:
     check.finite("map", *mapper.gaussians.parameters.values())
 
 
-@case("gaussians", "mapping.optimisation.map_optimiser.MapOptimiser.drop_unsound")
+@case("gaussians", "mapping.optimisation.MapOptimiser.drop_unsound")
 def nan_in_the_map(check: Check, seed: int) -> None:
     """One invalid Gaussian is dropped and does not stop the optimisation."""
     mapper, _ = _mapper(seed)

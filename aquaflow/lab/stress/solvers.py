@@ -70,7 +70,7 @@ def _finite_or_none(check: Check, problem: PoseProblem) -> None:
         check.finite("estimate", estimate.covariance, estimate.inlier_share, estimate.conditioning)
 
 
-@case("solvers", "tracking.pose.pnp.pose_from_scratch")
+@case("solvers", "tracking.pose.matcher.pose_from_scratch")
 def outliers_95_percent(check: Check, seed: int) -> None:
     """Nineteen matches of twenty are wrong: the pose is right, or there is none."""
     many = np.concatenate([_points(seed + i) for i in range(8)])
@@ -103,7 +103,7 @@ def nan_matches_in_bundle(check: Check, seed: int) -> None:
     check.below("median reprojection error in px", result.residual_px, 0.051)
 
 
-@case("solvers", "geometry.triangulation.MIN_DEPTH")
+@case("solvers", "geometry.two_view.MIN_DEPTH")
 def points_behind_the_camera(check: Check, seed: int) -> None:
     """Matches that meet behind the cameras, or all but on them, are no measurement."""
     points = _points(seed)
@@ -117,7 +117,7 @@ def points_behind_the_camera(check: Check, seed: int) -> None:
         check.true("none is good", not bool(result.good.any()))
 
 
-@case("solvers", "geometry.triangulation.MIN_PARALLAX_RAD")
+@case("solvers", "geometry.two_view.MIN_PARALLAX_RAD")
 def parallel_rays(check: Check, seed: int) -> None:
     """Without translation, and with points at infinity, there is no depth."""
     points = _points(seed)

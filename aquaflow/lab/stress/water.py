@@ -35,7 +35,7 @@ def _ranges() -> Tensor:
     return torch.tensor(RANGES_M)[None]
 
 
-@case("water", "water.image_formation.MAX_OPTICAL_DEPTH")
+@case("water", "water.medium.MAX_OPTICAL_DEPTH")
 def attenuation_0_to_50(check: Check, seed: int) -> None:
     """beta from 0 to 50 1/m over 1 cm to 1 km: transmission is never 0, its inverse never wild."""
     for beta in RATES:
@@ -50,7 +50,7 @@ def attenuation_0_to_50(check: Check, seed: int) -> None:
         check.finite(f"gradient at beta {beta}", gradient)
 
 
-@case("water", "water.image_formation.MAX_OPTICAL_DEPTH")
+@case("water", "water.medium.MAX_OPTICAL_DEPTH")
 def range_1_cm_to_1_km(check: Check, seed: int) -> None:
     """Ranges behind the camera, at 0 and beyond 1 km are no more transparent than clear water."""
     z = torch.tensor([[-1e3, -1.0, 0.0, *RANGES_M, 1e9]])
@@ -60,7 +60,7 @@ def range_1_cm_to_1_km(check: Check, seed: int) -> None:
         check.below("transmission", float(transmission.detach().max()), 1.0)
 
 
-@case("water", "water.image_formation.MIN_TRANSMISSION")
+@case("water", "water.medium.MIN_TRANSMISSION")
 def transmission_to_0(check: Check, seed: int) -> None:
     """Where no light arrives nothing is restored, and the mask is False."""
     image = torch.rand(1, len(RANGES_M), 3, generator=torch.Generator().manual_seed(seed))
@@ -92,7 +92,7 @@ def rates_at_0_and_50(check: Check, seed: int) -> None:
         check.below("error of beta_a", _off(medium(torch.eye(3)).beta_a, rate), 1e-3)
 
 
-@case("water", "mapping.gaussians.gaussians.MIN_RADIANCE")
+@case("water", "mapping.gaussians.MIN_RADIANCE")
 def black_and_glowing_radiance(check: Check, seed: int) -> None:
     """Radiance 0 and 100 become raw colours and back."""
     for value in (0.0, 1e-30, 1e-3, 1.0, 100.0):
@@ -123,7 +123,7 @@ def picture_through_bare_map(check: Check, seed: int) -> None:
             )
 
 
-@case("water", "render.view_loss.MIN_RANGE")
+@case("water", "render.photometric.MIN_RANGE")
 def depth_loss_at_range_0(check: Check, seed: int) -> None:
     """Pixels of range 0, drawn and not drawn, known and not known."""
     z = torch.tensor([[0.0, 0.0, 0.0, 1e-30, 1e9]], requires_grad=True)

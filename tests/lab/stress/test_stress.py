@@ -11,22 +11,18 @@ import pytest
 import torch
 
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry import camera, similarity
-from aquaflow.geometry import two_view as triangulation
+from aquaflow.geometry import camera, similarity, two_view
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.stress import suite, swim
 from aquaflow.lab.stress.case import REGISTRY, Check
-from aquaflow.mapping import gaussians
-from aquaflow.mapping import optimisation as map_optimiser
+from aquaflow.mapping import gaussians, optimisation
 from aquaflow.optimise.least_squares import NormalEquations
 from aquaflow.prior import flow, homography
-from aquaflow.render import adam, reference, views, water
-from aquaflow.render import photometric as view_loss
+from aquaflow.render import adam, photometric, reference, views, water
 from aquaflow.sources import preprocessing
 from aquaflow.tracking import current_keyframe
 from aquaflow.tracking.initialisation import bundle, initialiser
 from aquaflow.water import medium
-from aquaflow.water import medium as image_formation
 from tests.command_line import Cli, refused
 
 INFINITY = float("inf")
@@ -96,21 +92,21 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("on_the_camera_centre", [(reference, "NEAR_PLANE_M", -INFINITY)]),
     ("huge_scales", [(reference, "MAX_SIGMA_PX", INFINITY)]),
     ("tiny_scales", [(reference, "DILATION_PX2", 0.0)]),
-    ("attenuation_0_to_50", [(image_formation, "MAX_OPTICAL_DEPTH", INFINITY)]),
-    ("transmission_to_0", [(image_formation, "MIN_TRANSMISSION", 0.0)]),
+    ("attenuation_0_to_50", [(medium, "MAX_OPTICAL_DEPTH", INFINITY)]),
+    ("transmission_to_0", [(medium, "MIN_TRANSMISSION", 0.0)]),
     ("B_inf_at_0_and_1", [(medium, "B_INF_RANGE", (0.0, 1.0))]),
     ("rates_at_0_and_50", [(medium, "MIN_RATE", 0.0)]),
     ("black_and_glowing_radiance", [(gaussians, "MIN_RADIANCE", 0.0)]),
     ("picture_through_bare_map", [(water, "MIN_SOLID", 0.0)]),
-    ("depth_loss_at_range_0", [(view_loss, "MIN_RANGE", 0.0)]),
+    ("depth_loss_at_range_0", [(photometric, "MIN_RANGE", 0.0)]),
     ("rank_deficient", [(NormalEquations, "solve", unguarded_step)]),
     ("nan_matches_in_bundle", [(bundle, "is_measured", everything)]),
-    ("points_behind_the_camera", [(triangulation, "MIN_DEPTH", -INFINITY)]),
-    ("parallel_rays", [(triangulation, "MIN_PARALLAX_RAD", -1.0)]),
+    ("points_behind_the_camera", [(two_view, "MIN_DEPTH", -INFINITY)]),
+    ("parallel_rays", [(two_view, "MIN_PARALLAX_RAD", -1.0)]),
     ("projection_at_depth_0", [(camera, "MIN_DEPTH", -INFINITY)]),
     ("homography_horizon", [(homography, "MIN_DENOMINATOR", 0.0)]),
     ("poses_rounded_to_float32", [(similarity, "on_so3", lambda R: R)]),
-    ("nan_in_range_input", [(map_optimiser, "is_number", always)]),
+    ("nan_in_range_input", [(optimisation, "is_number", always)]),
     ("nan_in_pose_gradient", [(views, "is_usable", always)]),
     (
         "gradients_that_are_not_finite",
@@ -125,7 +121,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
         [
             (initialiser.Initialiser, "_trustworthy", always),
             (initialiser.Initialiser, "_is_decided", always),
-            (triangulation, "MIN_PARALLAX_RAD", -1.0),
+            (two_view, "MIN_PARALLAX_RAD", -1.0),
         ],
     ),
     pytest.param(
@@ -159,7 +155,7 @@ def test_a_pose_that_too_little_supports_is_not_believed(monkeypatch: pytest.Mon
 def test_without_the_finite_check_an_unsound_gaussian_stops_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(map_optimiser.MapOptimiser, "drop_unsound", lambda self: None)
+    monkeypatch.setattr(optimisation.MapOptimiser, "drop_unsound", lambda self: None)
     assert not suite.run_case(REGISTRY["nan_in_the_map"], seed=0).outcome.passed
 
 
