@@ -15,6 +15,7 @@ from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.tracking.lens_equations import LensView
 from aquaflow.tracking.overlay import OverlayFinder
+from aquaflow.tracking.self_calibration import FoundLens
 from aquaflow.types import Frame
 from tests.slam_scenes import ToldTracker, frame_of
 
@@ -83,8 +84,9 @@ def keypoints_of_the_lens(
     """[M, 2] those that the lens is found from, and [H, W] what is no overlay."""
     pixels, shown = [], []
 
-    def spy(views: list[LensView], start: object) -> None:
+    def spy(views: list[LensView], start: object) -> FoundLens:
         pixels.extend(view.keypoints.pixels for view in views)
+        return FoundLens(np.zeros(5), np.full(2, 0.02), 3e-4, len(views), len(pixels))
 
     def keep(finder: OverlayFinder, frame: Frame) -> Frame:
         masked = find(finder, frame)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from .child import Ended, Limits, home_of, run_forked, temporary_of
@@ -83,6 +83,7 @@ def test_options_are_known_with_their_types() -> None:
     )
 
 
+@settings(max_examples=20)  # each draws the words of a whole command
 @given(st.data())
 def test_what_is_drawn_can_be_an_argv(data: st.DataObject) -> None:
     command = data.draw(st.sampled_from(all_commands()))

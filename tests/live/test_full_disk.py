@@ -70,6 +70,7 @@ def test_with_room_again_the_dive_is_taken_up_and_finished(
     assert (folder / "dive" / "map.ply").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_deliverables_of_an_earlier_moment_are_set_aside_and_the_dive_is_finished_with_room_again(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:

@@ -100,6 +100,7 @@ def test_a_line_has_first_and_last_tenth_memory_and_bytes_per_1000_frames(tmp_pa
     assert lines[3].count("|") == lines[2].count("|")
 
 
+@pytest.mark.slow
 def test_a_survey_is_mapped_and_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes: list[tuple[int, int]] = []
 
