@@ -50,7 +50,7 @@ def test_a_live_run_says_so(settings: Path, small_recording: Path, tmp_path: Pat
     assert f"Warning: {SAID}.\n" in ran.out
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_benchmark_counts_it_as_failed(small_recording: Path, tmp_path: Path) -> None:
     scene = BenchmarkScene("reef", str(small_recording), refine_share=0.01)
     row = in_process(BenchJob(scene, "balanced", str(tmp_path / "dive"), overrides=THE_PAPERS))

@@ -165,7 +165,7 @@ def test_where_the_guess_failed_each_focal_length_that_may_be_is_tried(
     assert all(each.calibrated for each in tried)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_survey_that_shows_its_focal_length_late_is_placed_without_calibration(
     shared_data: Path, tmp_path: Path
 ) -> None:

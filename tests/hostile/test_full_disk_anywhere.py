@@ -55,7 +55,7 @@ def test_mapping_onto_a_full_disk_is_told_in_one_sentence(
     assert half_written(dive) == []
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_benchmark_onto_a_full_disk_is_told_in_one_sentence(
     small_recording: Path, tmp_path: Path
 ) -> None:

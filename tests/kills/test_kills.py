@@ -1,4 +1,5 @@
-"""kill -9 at random moments, in a few of them here; ``make test-all`` takes twenty of each."""
+"""kill -9 at random moments, in a few of them here; ``make test-all`` takes twenty of each, and
+``batch``, whose every case maps several dives."""
 
 from __future__ import annotations
 
@@ -18,11 +19,11 @@ def bench(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Be
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [each for each in COMMANDS if each != "batch"])
 def test_a_killed_command_leaves_nothing_that_passes_as_finished_and_can_be_given_again(
     bench: Bench, command: str
 ) -> None:
-    tally = attack(bench, command, moments=1 if command == "batch" else 2, seed=SEED)
+    tally = attack(bench, command, moments=2, seed=SEED)
     assert tally.wrong == []
     assert tally.found.total() > 0
 

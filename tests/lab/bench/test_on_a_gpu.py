@@ -200,7 +200,7 @@ FEW = {
 """Of a dive that the dense reference can draw."""
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_a_dive_on_a_device_is_the_row_that_one_on_the_cpu_is(
     gpu: Counting, small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -279,7 +279,7 @@ def moved(browser: Browser, before: np.ndarray) -> float:
     return float(np.linalg.norm(eye(browser)[0] - before))
 
 
-@pytest.mark.parametrize("size", TABLETS)
+@pytest.mark.parametrize("size", [TABLETS[0], pytest.param(TABLETS[1], marks=pytest.mark.slow)])
 def test_one_finger_turns_two_move_and_zoom_and_a_tap_points(
     touched: Browser, size: tuple[int, int], tmp_path: Path
 ) -> None:
