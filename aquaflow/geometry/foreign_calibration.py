@@ -106,7 +106,7 @@ class _Keys:
         found = self.value(key)
         rows = found.get("data") if isinstance(found, Mapping) else found
         if not isinstance(rows, (list, tuple)):
-            raise _NotUnderstoodError(f"key '{key}' is {_shown(found)}, which is no list")
+            raise _NotUnderstoodError(f"key '{key}' is {_quote(found)}, which is no list")
         flat: list[float] = []
         for row in rows:
             cells = row if isinstance(row, (list, tuple)) else [row]
@@ -120,19 +120,19 @@ class _Keys:
         name = self.value(key, usual)
         known = MODELS.get(str(name).lower())
         if known is None:
-            raise _NotUnderstoodError(f"key '{key}' is {_shown(name)}, which is not known")
+            raise _NotUnderstoodError(f"key '{key}' is {_quote(name)}, which is not known")
         return known
 
     def _as_number(self, key: str, value: Any) -> float:
         try:
             return float(value)
         except (TypeError, ValueError):
-            raise _NotUnderstoodError(f"key '{key}' is {_shown(value)}, which is no number") from (
+            raise _NotUnderstoodError(f"key '{key}' is {_quote(value)}, which is no number") from (
                 None
             )
 
 
-def _shown(value: Any) -> str:
+def _quote(value: Any) -> str:
     return f"'{printable(str(value))[:40]}'"
 
 
@@ -195,7 +195,7 @@ def _kalibr(cameras: list[Values]) -> Values:
         raise _NotUnderstoodError(f"it holds {len(cameras)} cameras; leave one of them, as cam0")
     keys = _Keys(cameras[0])
     if (model := keys.value("camera_model")) != "pinhole":
-        raise _NotUnderstoodError(f"key 'camera_model' is {_shown(model)}, which is not known")
+        raise _NotUnderstoodError(f"key 'camera_model' is {_quote(model)}, which is not known")
     fx, fy, cx, cy = keys.numbers("intrinsics", 4)[:4]
     size, d = keys.numbers("resolution", 2), keys.numbers("distortion_coeffs")
     return _values(size, (fx, fy, cx + 0.5, cy + 0.5), keys.model("distortion_model"), d)
@@ -207,7 +207,7 @@ def _colmap(text: str) -> Values:
         raise _NotUnderstoodError(f"it holds {len(lines)} cameras; leave the line of one")
     words = lines[0]
     if len(words) < 4 or words[1] not in COLMAP:
-        named = f"model {_shown(words[1])} is not known" if len(words) > 3 else "its line is short"
+        named = f"model {_quote(words[1])} is not known" if len(words) > 3 else "its line is short"
         raise _NotUnderstoodError(named)
     names, kind = COLMAP[words[1]]
     if len(words) != 4 + len(names.split()):
@@ -241,7 +241,7 @@ def _xml(text: str) -> Values:
     keys = _Keys(given)
     kind = given.get("projection", found.get("type", "frame"))
     if kind != "frame":
-        raise _NotUnderstoodError(f"projection {_shown(kind)} is not known; only 'frame' is")
+        raise _NotUnderstoodError(f"projection {_quote(kind)} is not known; only 'frame' is")
     for name in ("k4", "b2", "p3", "p4"):
         if keys.number(name, 0.0):
             raise _NotUnderstoodError(f"key '{name}' is not zero: fit the camera without it")
@@ -272,7 +272,7 @@ def _odm(text: str) -> Values:
         "fisheye": "fisheye", "fisheye_opencv": "fisheye",
     }.get(str(named := keys.value("projection_type")))  # fmt: skip
     if kind is None:
-        raise _NotUnderstoodError(f"key 'projection_type' is {_shown(named)}, which is not known")
+        raise _NotUnderstoodError(f"key 'projection_type' is {_quote(named)}, which is not known")
     width, height = keys.number("width"), keys.number("height")
     side = max(width, height)  # OpenSfM's unit of length
     focal = keys.number("focal_x" if "focal_x" in keys else "focal")

@@ -292,7 +292,7 @@ class McapCamera:
                 continue
             try:
                 fields = self._payloads.decode(found)
-                stored, data = self._stored(fields)
+                stored, data = self._decode(fields)
             except (UnreadablePictureError, UnreadablePayloadError) as error:
                 yield Dropped(place.index, place.t_ns, f"{self.name_of(place.index)} {error}")
                 continue
@@ -301,7 +301,7 @@ class McapCamera:
             taken = replace(place, t_ns=_taken_ns(found, fields) - self.origin_ns)
             yield self._frame(taken, image, received_as(data) if plain else None)
 
-    def _stored(self, fields: Any) -> tuple[Stored, bytes]:
+    def _decode(self, fields: Any) -> tuple[Stored, bytes]:
         """The picture, and the bytes of its file."""
         data = bytes(fields.data)
         if self._kind == COMPRESSED:
@@ -313,7 +313,7 @@ class McapCamera:
     def _whole(self) -> Iterator[Stored]:
         for message in McapMessages(self._messages.files).of(self.topic.__eq__):
             with suppress(UnreadablePictureError, UnreadablePayloadError):
-                yield self._stored(self._payloads.decode(message))[0]
+                yield self._decode(self._payloads.decode(message))[0]
 
     def _other_topics(self) -> list[str]:
         heads = (each for each in self._messages.heads if picture_kind(each) is not None)

@@ -66,7 +66,7 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
         ) from error
     with ExitStack() as stack:
         try:
-            files = [_unpacked(file, stack) for file in _files_of(path)]
+            files = [_unpack(file, stack) for file in _files_of(path)]
             reader = AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             reader.open()
         except Exception as error:  # of rosbags, YAML, SQLite, MCAP, and each compression
@@ -77,7 +77,7 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
         yield reader
 
 
-def _unpacked(file: Path, stack: ExitStack) -> Path:
+def _unpack(file: Path, stack: ExitStack) -> Path:
     """The file, or what it was before it was compressed, for as long as ``stack`` lasts."""
     if not file.name.endswith(ZSTD):
         return file

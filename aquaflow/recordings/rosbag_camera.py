@@ -129,7 +129,7 @@ class RosbagCamera:
         t_ns = stamp_of(message, received_ns) - self.origin_ns
         arrival_ns = max(received_ns - self.origin_ns, t_ns)
         try:
-            stored, data = _stored(message, kind)
+            stored, data = _decode(message, kind)
         except UnreadablePictureError as error:
             return Dropped(index, t_ns, f"{self.name_of(index)} {error}")
         image = self._white.to_rgb(stored, lambda: stated_white(data), self._whole)
@@ -142,10 +142,10 @@ class RosbagCamera:
             connections = picture_connections(reader, self.topic)
             for connection, _, data in messages_in(reader, connections, []):
                 with suppress(UnreadablePictureError):
-                    yield _stored(decode(reader, connection, data), connection.msgtype)[0]
+                    yield _decode(decode(reader, connection, data), connection.msgtype)[0]
 
 
-def _stored(message: Any, kind: str) -> tuple[Stored, bytes]:
+def _decode(message: Any, kind: str) -> tuple[Stored, bytes]:
     """The picture, and the bytes of its file."""
     if message is None:
         raise UnreadablePictureError("is damaged")
