@@ -168,7 +168,7 @@ class WhiteLevel:
 
     def to_rgb(
         self,
-        picture: Stored,
+        picture: Stored,  # [H, W] or [H, W, 3]
         stated: Callable[[], int | None],
         whole: Callable[[], Iterator[Stored]],
     ) -> npt.NDArray[np.uint8]:
@@ -194,7 +194,7 @@ def _white_of(stated: int | None, whole: Callable[[], Iterator[Stored]]) -> tupl
 
 
 def to_rgb(
-    picture: Stored,
+    picture: Stored,  # [H, W] or [H, W, 3]
     white: int,
 ) -> npt.NDArray[np.uint8]:
     """[H, W, 3] uint8 RGB; 16 bits are scaled so that ``white`` becomes 256."""

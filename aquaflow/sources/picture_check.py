@@ -114,7 +114,10 @@ def oddities(
     return check.oddities()
 
 
-def _correlation(a: Grey, b: Grey) -> float:
+def _correlation(
+    a: Grey,  # [h, w]
+    b: Grey,  # [h, w]
+) -> float:
     a, b = a - a.mean(), b - b.mean()
     spread = float(np.sqrt((a * a).mean() * (b * b).mean()))
     return 1.0 if spread < FLAT * FLAT else float((a * b).mean()) / spread

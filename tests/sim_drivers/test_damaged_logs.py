@@ -89,7 +89,7 @@ def test_an_mcap_file_that_cannot_be_opened_costs_itself(tmp_path: Path) -> None
     (tmp_path / "0000.mcap").mkdir()
     (tmp_path / "0001.mcap").symlink_to("0001.mcap")
     messages = McapMessages([tmp_path / "0000.mcap", tmp_path / "0001.mcap"])
-    assert messages.counts() is None
+    assert messages.counts is None
     assert list(messages) == []
     assert [note.partition(" cannot be read: ")[0] for note in messages.notes] == [
         "0000.mcap", "0001.mcap",
