@@ -240,7 +240,7 @@ class Slam:
 
     @property
     def mappers(self) -> dict[int, Mapper]:
-        """By sub-map; complete after ``finish``."""
+        """The mappers by sub-map; complete after ``finish``."""
         return self.maps.mappers
 
     @property
@@ -253,7 +253,7 @@ class Slam:
         return self.metric.of(sub_map)
 
     def metric_frames(self) -> dict[int, WorldFrame]:
-        """By sub-map, after ``finish``: how its world lies in n."""
+        """The metric frames by sub-map, after ``finish``: how each world lies in n."""
         return {each.sub_map: self.metric_frame(each.sub_map) for each in self.keyframes.keyframes}
 
     # --- an earlier run -----------------------------------------------------------------------

@@ -169,7 +169,7 @@ class PixelFormat:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Of the pieces of memory that hold any picture of this format."""
+        """Sizes of the pieces of memory that hold any picture of this format."""
         brightness, colours = self.stride * self.height, self.stride * self.height // 2
         if self.pixels == "NM12":
             return brightness, colours

@@ -32,7 +32,7 @@ class MjpegServer:
 
     @property
     def url(self) -> str:
-        """Of the stream."""
+        """Address of the stream."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/video"
 
     def __enter__(self) -> MjpegServer:

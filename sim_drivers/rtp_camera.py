@@ -40,7 +40,7 @@ class Packetizer:
         self._number = 0
 
     def packets(self, units: Sequence[bytes], t_ns: int) -> list[bytes]:
-        """Of one picture that was taken at ``t_ns``; the last is marked."""
+        """The packets of one picture that was taken at ``t_ns``; the last is marked."""
         aggregated = [_aggregate(units[:-1])] if len(units) > 1 else []
         payloads = [*aggregated, *_fragments(units[-1])]
         ticks = t_ns * CLOCK_HZ // 1_000_000_000 & 0xFFFFFFFF

@@ -284,7 +284,7 @@ PAGE_BITS = 12
 
 
 def refusal(number: int) -> OSError:
-    """As the kernel refuses."""
+    """The error as the kernel refuses."""
     return OSError(number, os.strerror(number))
 
 

@@ -79,7 +79,7 @@ class Map:
 
     @property
     def unit(self) -> str:
-        """Of lengths: ``m`` or ``map units``."""
+        """Unit of lengths: ``m`` or ``map units``."""
         return self.metric_frame.unit
 
     def _pose(self, T_mc: Sim3) -> Sim3:

@@ -54,7 +54,7 @@ class CalibrationFit:
 
     @property
     def rms_px(self) -> float:
-        """Of the corners that were kept, per coordinate."""
+        """Root mean square error of the corners that were kept, per coordinate."""
         left = [each[keep] for each, keep in zip(self.residuals, self.kept, strict=True)]
         return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
 
@@ -309,7 +309,7 @@ class CameraUnknowns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers, in their order."""
+        """Names of the numbers, in their order."""
         return PORT if self.port else LENS[self.start.distortion_model]
 
     @property

@@ -152,7 +152,7 @@ def devices_on_stderr() -> None:
 
 
 def table_console() -> Console:
-    """As wide as the terminal, or as the table where there is none."""
+    """A console as wide as the terminal, or as the table where there is none."""
     from rich.console import Console
 
     console = Console()

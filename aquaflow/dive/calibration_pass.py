@@ -240,7 +240,7 @@ class FoundCamera:
     """True if the dive was mapped with it; False if it is known only at the end."""
 
     def to_json(self) -> dict[str, Any]:
-        """For metrics.json; px of the mapped width."""
+        """The lens as metrics.json has it; px of the mapped width."""
         focal, sigma = self.camera.fx, self.lens.sigma
         return {
             "verdict": "found" if self.lens.known else "cannot be told",

@@ -110,7 +110,7 @@ class Deliverables:
 
     @property
     def metric_frame(self) -> WorldFrame:
-        """Of the largest sub-map."""
+        """The metric frame of the largest sub-map."""
         return self.outputs.frame(self._main)
 
     def _in_n(self, poses: dict[int, Sim3]) -> dict[int, Sim3]:

@@ -128,7 +128,7 @@ class Dive:
 
     @cached_property
     def name(self) -> str:
-        """Of the dive, for people."""
+        """Name of the dive, for people."""
         return printable(self.path.resolve().name)
 
     @cached_property
@@ -219,8 +219,8 @@ class Dive:
 
     @cached_property
     def metric_frames(self) -> Mapping[int, WorldFrame]:
-        """By sub-map: what its world is, how well that is known, and from which telemetry; empty
-        for a dive that was mapped by an older AquaFlow."""
+        """The metric frame of each sub-map: what its world is, how well that is known, and from
+        which telemetry; empty for a dive that was mapped by an older AquaFlow."""
         return read_metric_file(self.path)
 
     @cached_property
@@ -230,16 +230,16 @@ class Dive:
 
     @property
     def frame(self) -> WorldFrame:
-        """Of the largest sub-map."""
+        """The metric frame of the largest sub-map."""
         return self.frame_of(self.main)
 
     def frame_of(self, sub_map: int) -> WorldFrame:
-        """Of a sub-map; the unknown one where nothing is known of it."""
+        """The metric frame of a sub-map; the unknown one where nothing is known of it."""
         return self.metric_frames.get(sub_map, WorldFrame.unknown())
 
     @property
     def unit(self) -> str:
-        """Of lengths in the largest sub-map: ``m`` or ``map units``."""
+        """Unit of lengths in the largest sub-map: ``m`` or ``map units``."""
         if self.metric_frames:
             return self.frame.unit
         return str(self.metrics.get("unit", WorldFrame.unknown().unit))
@@ -259,13 +259,14 @@ class Dive:
 
     @cached_property
     def attenuations(self) -> Mapping[int, Sequence[float]]:
-        """Of red, green and blue by sub-map, per map unit: of those whose water is known."""
+        """Attenuation of red, green and blue by sub-map, per map unit: of those whose water is
+        known."""
         water, scale = self.medium, self.frame.T_nm.scale
         return {} if water is None else {self.main: [scale * rate for rate in water.beta_a]}
 
     @cached_property
     def maps(self) -> Mapping[int, Mapper]:
-        """Of a dive that is in memory, by sub-map; of one in a folder ask :meth:`map`."""
+        """The maps by sub-map, of a dive that is in memory; of one in a folder ask :meth:`map`."""
         return {}
 
     def map(self, sub_map: int | None = None) -> Mapper:

@@ -42,7 +42,7 @@ class Navigation:
     altitude_m_at: Callable[[int], float | None] = _nothing
 
     def utc_of(self, t_ns: int) -> datetime | None:
-        """With its time zone; None where no source stated the time."""
+        """Moment in UTC, with its time zone; None where no source stated the time."""
         return None if self.clock is None else self.clock.utc_of(t_ns)
 
     @staticmethod
@@ -64,7 +64,7 @@ class MetricOutputs:
     navigation: Navigation = Navigation()
 
     def frame(self, sub_map: int) -> WorldFrame:
-        """Of a sub-map; the unknown one where there is none."""
+        """The metric frame of a sub-map; the unknown one where there is none."""
         return self.frames.get(sub_map, WorldFrame.unknown())
 
 
@@ -233,7 +233,7 @@ def speeds_of(
     t_s: Array,  # [N] increasing
     positions: Array,  # [N, 3] m
 ) -> list[float | None]:
-    """Of each pose: from the first to the last pose of the span around it, at least from the
+    """Speed of each pose: from the first to the last pose of the span around it, at least from the
     neighbour before to the one after."""
     number, last = np.arange(len(t_s)), len(t_s) - 1
     first = np.searchsorted(t_s, t_s - 0.5 * SPEED_SPAN_S)

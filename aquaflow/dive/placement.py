@@ -43,7 +43,7 @@ class Placement:
 
     @property
     def epsg(self) -> int | None:
-        """Of the grid; None where there is none."""
+        """EPSG code of the grid; None where there is none."""
         return None if self.grid is None else self.grid.epsg
 
     def on_grid(

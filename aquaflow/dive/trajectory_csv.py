@@ -62,7 +62,7 @@ class PoseRow:
     """1 sigma of the heading of n."""
 
     def cells(self) -> list[str]:
-        """As text."""
+        """The row as text."""
         return [_text(field.name, getattr(self, field.name)) for field in fields(self)]
 
 

@@ -53,7 +53,7 @@ class RunningDive(Protocol):
 
     @property
     def maps(self) -> InspectedMaps:
-        """Of all its sub-maps."""
+        """The maps of all its sub-maps."""
         ...
 
 
@@ -89,7 +89,7 @@ class CoverageView(DiveView, Protocol):
         ...
 
     def to_json(self) -> dict[int, dict[str, Any]]:
-        """For the page, by sub-map."""
+        """What the page shows of the coverage, by sub-map."""
         ...
 
     def png(self) -> bytes | None:

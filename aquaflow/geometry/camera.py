@@ -173,7 +173,7 @@ class CameraFile(BaseModel):
         return "radtan"
 
     def camera(self) -> CameraModel:
-        """For computing."""
+        """The camera to compute with."""
         return CameraModel(
             self.width,
             self.height,

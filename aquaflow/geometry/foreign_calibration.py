@@ -44,8 +44,8 @@ COLMAP: dict[str, tuple[str, Model]] = {
 
 
 def values_of_file(path: Path) -> Values | None:
-    """Of a file that is no YAML: COLMAP's text, Metashape's or OpenCV's XML, OpenDroneMap's JSON;
-    None for any other.
+    """The values of a file that is no YAML: COLMAP's text, Metashape's or OpenCV's XML,
+    OpenDroneMap's JSON; None for any other.
 
     Raises:
         InputError: it cannot be read.
@@ -62,7 +62,7 @@ def values_of_file(path: Path) -> Values | None:
 
 
 def values_of_yaml(path: Path, data: Values) -> Values | None:
-    """Of a mapping that ROS, OpenCV or Kalibr wrote; None if it is none of these.
+    """The values of a mapping that ROS, OpenCV or Kalibr wrote; None if it is none of these.
 
     Raises:
         ConfigError: it is one and holds no camera that we know.
@@ -93,7 +93,7 @@ class _Keys:
         return key in self._values
 
     def value(self, key: str, usual: Any = None) -> Any:
-        """As it stands; ``usual`` where it is missing, unless that is None."""
+        """The value as it stands; ``usual`` where it is missing, unless that is None."""
         if key not in self._values and usual is None:
             raise _NotUnderstoodError(f"key '{key}' is missing")
         return self._values.get(key, usual)
@@ -102,7 +102,7 @@ class _Keys:
         return self._as_number(key, self.value(key, usual))
 
     def numbers(self, key: str, least: int = 0) -> list[float]:
-        """Of a list, of rows, or of a matrix as ROS and OpenCV write it, row by row."""
+        """The numbers of a list, of rows, or of a matrix as ROS and OpenCV write it, row by row."""
         found = self.value(key)
         rows = found.get("data") if isinstance(found, Mapping) else found
         if not isinstance(rows, (list, tuple)):

@@ -212,7 +212,7 @@ class FlatPortFile(_PortFile):
         return self
 
     def port(self) -> FlatPort:
-        """For computing; the normal is made a unit vector."""
+        """The port to compute with; the normal is made a unit vector."""
         normal = np.array(self.normal)
         length = float(np.linalg.norm(normal))
         # A vector that is one already keeps every bit.
@@ -238,7 +238,7 @@ class DomePortFile(_PortFile):
         return self
 
     def port(self) -> DomePort:
-        """For computing."""
+        """The port to compute with."""
         indexes = self.glass_index, self.water_index
         centre = _triple(self.centre_m)
         return DomePort(self.radius_m, self.thickness_m, centre, *indexes, self.range_m)
@@ -268,5 +268,5 @@ def as_stated(value: Any) -> Any:
 
 
 def port_of(file: FlatPortFile | DomePortFile | None) -> Port | None:
-    """For computing."""
+    """The port to compute with."""
     return None if file is None else file.port()

@@ -131,7 +131,8 @@ def unpack(
 
 
 def features_dtype(count: int, dimension: int) -> np.dtype[np.void]:
-    """Of ``count`` keypoints whose descriptors have ``dimension`` numbers, each kind together."""
+    """Data type of ``count`` keypoints whose descriptors have ``dimension`` numbers, each kind
+    together."""
     return np.dtype(
         [
             ("pixels", "<u2", (count, 2)),
@@ -248,7 +249,7 @@ class Pointmap:
             return np.where(self.rho[..., None] > 1e-6, rays / self.rho[..., None], np.nan)
 
     def copy(self) -> Pointmap:
-        """With arrays of its own; learned depths are never changed in place."""
+        """A copy with arrays of its own; learned depths are never changed in place."""
         return replace(self, rho=self.rho.copy(), variance=self.variance.copy())
 
 
@@ -353,7 +354,7 @@ class PlacesFile:
         return {place.number: place for place in self.places}
 
     def keypoints(self, number: int) -> KeypointDepths:
-        """Of a keyframe, read from the file at each call.
+        """The keypoints of a keyframe, read from the file at each call.
 
         Raises:
             InputError: it is damaged.

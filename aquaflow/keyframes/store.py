@@ -190,7 +190,7 @@ class KeyframeStore:
         return self.keyframes[number]
 
     def cameras_of(self, number: int) -> tuple[CameraModel, CameraModel]:
-        """Of encoding and pointmap."""
+        """The cameras of encoding and pointmap."""
         return self._cameras[number]
 
     def close(self, keep: bool = False) -> None:

@@ -30,7 +30,7 @@ class ClockReading:
 
     @property
     def dive_ns(self) -> int:
-        """On the dive's clock."""
+        """The reading on the dive's clock."""
         return self.monotonic_ns + self.dive_shift_ns
 
     @staticmethod
@@ -59,7 +59,7 @@ class ClockReading:
         return self.dive_ns + passed - now.monotonic_ns
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """The reading as plain values."""
         return asdict(self)
 
 

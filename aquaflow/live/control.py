@@ -108,7 +108,7 @@ class ServiceControl:
     # --- the service's side ---------------------------------------------------------------------
 
     def wait(self, seconds: float) -> None:
-        """Until somebody asks for something, at most so long."""
+        """Wait until somebody asks for something, at most so long."""
         self._asked.wait(max(seconds, 0.0))
         self._asked.clear()
 

@@ -71,7 +71,7 @@ class DeliverableUpdater:
         self._ended = True
 
     def to_json(self) -> dict[str, Any]:
-        """For /health."""
+        """Counts for /health."""
         age_s = None if self._written_s is None else round(self._now_s() - self._written_s, 1)
         return {"written": self.written, "age_s": age_s, "cpu_s": round(self.took_s, 3)}
 

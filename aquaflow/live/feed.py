@@ -128,7 +128,7 @@ class Feed(Protocol):
         ...
 
     def name_of(self, index: int) -> str:
-        """Of a frame, for frames.csv."""
+        """Source name of a frame, for frames.csv."""
         ...
 
     def describe(self) -> dict[str, dict[str, object]]:
@@ -148,7 +148,8 @@ class Feed(Protocol):
         ...
 
     def stated_mounting(self) -> MountingConfig | None:
-        """Of the mapping camera in the body; see :func:`aquaflow.sources.mounting_of`."""
+        """Stated mounting of the mapping camera in the body; see
+        :func:`aquaflow.sources.mounting_of`."""
         ...
 
     def dive_s(self) -> float | None:

@@ -118,7 +118,8 @@ class NoFeed:
         return self._calibration
 
     def name_of(self, index: int) -> str:
-        """As the dive's rows have it; raises LookupError for a frame that is not among them."""
+        """Source name as the dive's rows have it; raises LookupError for a frame that is not among
+        them."""
         return self._names[index]
 
     def describe(self) -> dict[str, dict[str, object]]:

@@ -254,7 +254,7 @@ Devices = Mapping[str, Mapping[str, object]]
 
 
 def silent_camera(devices: Devices) -> ServiceWarning:
-    """Of the camera that maps, which is the first."""
+    """Warning of the camera that maps, which is the first."""
     for name, device in devices.items():
         if device["kind"] == "camera":
             return ServiceWarning(str(device["reason"]), state.no_picture(name))
@@ -262,14 +262,14 @@ def silent_camera(devices: Devices) -> ServiceWarning:
 
 
 def inconsistency(found: InconsistentKeyframe | None) -> ServiceWarning | None:
-    """Of a finding of the monitor of consistency."""
+    """Warning of a finding of the monitor of consistency."""
     return None if found is None else ServiceWarning(str(found), state.OF_CAUSE[found.cause])
 
 
 def of_the_machine(
     degradation: Degradation, pressure: Pressure, limits: LimitsConfig
 ) -> list[ServiceWarning]:
-    """Of memory, heat and disk."""
+    """Warnings of memory, heat and disk."""
     troubles, level, need = [], degradation.level, degradation.need
     if level is not DegradationLevel.FULL and need is not None:
         sentence = state.doing_less(level, need.shortage)
@@ -281,7 +281,7 @@ def of_the_machine(
 
 
 def of_the_stages(maps: MapThread, failures: Failures) -> list[ServiceWarning]:
-    """Of what raises again and again."""
+    """Warnings of what raises again and again."""
     troubles = []
     if maps.failing:
         troubles.append(ServiceWarning(f"mapping fails: {maps.last_failure}", state.MAPPING_FAILS))
@@ -290,7 +290,7 @@ def of_the_stages(maps: MapThread, failures: Failures) -> list[ServiceWarning]:
 
 
 def of_the_devices(devices: Devices) -> list[ServiceWarning]:
-    """Of links that are silent, and a recorder that ended."""
+    """Warnings of links that are silent, and a recorder that ended."""
     troubles = []
     for name, device in devices.items():
         if device["kind"] == "link" and device["state"] != "connected":

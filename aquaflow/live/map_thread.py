@@ -182,7 +182,8 @@ class MapThread:
         return self._maps.held_out
 
     def usable_memory(self) -> float | None:
-        """Of the maps' device, as :meth:`aquaflow.mapping.work.OwnedMaps.usable_memory`."""
+        """Usable share of the maps' device, as
+        :meth:`aquaflow.mapping.work.OwnedMaps.usable_memory`."""
         return self._maps.usable_memory()
 
     @property

@@ -100,7 +100,7 @@ class _SubMapPlan:
         }  # fmt: skip
 
     def pose(self, T_mc: Sim3) -> dict[str, Any]:
-        """Of the camera."""
+        """Pose of the camera."""
         T_nc = self._frame.pose(T_mc)
         ahead = self._axes @ T_nc.R[:, 2]
         length = float(np.linalg.norm(ahead))

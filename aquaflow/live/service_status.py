@@ -25,7 +25,7 @@ class ServiceStatus(Protocol):
 
     @property
     def counters(self) -> Counters:
-        """Of the present dive; between dives of nothing."""
+        """Counters of the present dive; between dives of nothing."""
         ...
 
     @property

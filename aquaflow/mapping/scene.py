@@ -174,7 +174,7 @@ class Scene:
         return centres
 
     def nearest_cameras(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
+        """Place of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
         centres = pose_in(np.stack([view.T_wc.t for view in views]), self.device)
         means = self.gaussians.means
         # Parts of one size: a product with a single row would be rounded otherwise.

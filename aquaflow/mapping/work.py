@@ -58,7 +58,7 @@ class MapWork(Protocol):
 
     @property
     def mappers(self) -> dict[int, Mapper]:
-        """By sub-map. Owned by the mapping thread while it runs."""
+        """The mappers by sub-map. Owned by the mapping thread while it runs."""
         ...
 
     @property
@@ -120,7 +120,7 @@ class OwnedMaps(MapWork, Protocol):
         ...
 
     def usable_memory(self) -> float | None:
-        """Of the device's own memory, what new tensors may have, in [0, 1]; None on the CPU."""
+        """Share of the device's own memory, what new tensors may have, in [0, 1]; None on the CPU."""
         ...
 
     def save_pictures(self) -> list[Path]:

@@ -174,7 +174,7 @@ class NormalEquations:
         weights: Array | float = 1.0,  # [M] of the squares, by a kernel
         cost: float | None = None,  # by the same kernel; half the squares if None
     ) -> NormalEquations:
-        """Of M residuals."""
+        """Normal equations of M residuals."""
         weighted = J * np.broadcast_to(weights, r.shape)[:, None]
         if cost is None:
             cost = 0.5 * float(r @ r)
@@ -185,7 +185,7 @@ class NormalEquations:
         departure: Array,  # [n] from the expected value
         sigma: Array,  # [n] of it, infinite where nothing is expected
     ) -> NormalEquations:
-        """Of what was known about each number before."""
+        """Expectation of what was known about each number before."""
         r = departure / sigma
         return NormalEquations(np.diag(sigma**-2.0), r / sigma, 0.5 * float(r @ r))
 
@@ -243,7 +243,7 @@ class RobustFit:
         self,
         x: Array,  # [P]
     ) -> float:
-        """By the noise last found."""
+        """The cost by the noise last found."""
         left = (x - self.expected) / self.sigma
         size = np.abs(self.residuals(x)) / self.noise
         return float(self.kernel.cost(size).sum()) + 0.5 * float(left @ left)

@@ -243,8 +243,8 @@ class ImagePadding:
 
     @staticmethod
     def of(height: int, width: int, frame: tuple[int, int], cell_px: int) -> ImagePadding:
-        """Of a picture of ``height`` x ``width`` px in the middle of a ``frame`` (height, width),
-        as large as fits."""
+        """The padding of a picture of ``height`` x ``width`` px in the middle of a ``frame``
+        (height, width), as large as fits."""
         scale = min(frame[0] / height, frame[1] / width)
         inner = [
             min(max(round(scale * side / cell_px), 1), available // cell_px) * cell_px

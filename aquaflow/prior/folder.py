@@ -139,7 +139,7 @@ def read_card(folder: Path) -> PriorCard:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file of any size."""
+    """SHA-256 of a file of any size."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(READ_BYTES):

@@ -126,7 +126,7 @@ class OracleDescriber:
         self,
         image: Picture,  # [H, W, 3]
     ) -> Picture:
-        """As it is."""
+        """The picture as it is."""
         return image
 
     def features(

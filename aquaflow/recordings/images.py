@@ -149,7 +149,7 @@ class ImageFolder:
         return width, height
 
     def sources(self) -> dict[str, str]:
-        """Of times, calibration, white and position."""
+        """Sources of times, calibration, white and position."""
         found = self._facts | self._white.sources
         if self._turned:
             found["position"] = f"{self._turned} pictures are turned as their EXIF says"

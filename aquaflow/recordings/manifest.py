@@ -111,11 +111,11 @@ class MountedCamera:
         return self._recording.notes
 
     def sources(self) -> dict[str, str]:
-        """Of what the recording itself states."""
+        """Sources of what the recording itself states."""
         return sources_of(self._recording)
 
     def stated_mounting(self) -> MountingConfig:
-        """As the manifest states it."""
+        """The mounting as the manifest states it."""
         return self._mounting
 
     def name_of(self, index: int) -> str:

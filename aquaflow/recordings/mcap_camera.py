@@ -120,7 +120,7 @@ class McapCamera:
         return camera
 
     def sources(self) -> dict[str, str]:
-        """Of calibration, topic and white."""
+        """Sources of calibration, topic and white."""
         return self._facts | self._white.sources
 
     @property
@@ -160,7 +160,7 @@ class McapCamera:
         """Nothing stays open between passes."""
 
     def stated_mounting(self) -> MountingConfig | None:
-        """Of the camera in the vehicle, as the recorder knew it.
+        """Stated mounting of the camera in the vehicle, as the recorder knew it.
 
         Raises:
             InputError: the statement in the file is damaged.

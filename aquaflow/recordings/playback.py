@@ -68,7 +68,7 @@ class Playback:
         return None if self._camera is None else self._camera.frame_count
 
     def stated_mounting(self) -> MountingConfig | None:
-        """Of the camera; see :func:`aquaflow.sources.mounting_of`."""
+        """Stated mounting of the camera; see :func:`aquaflow.sources.mounting_of`."""
         return mounting_of(self._camera)
 
     def _samples(self, source: TelemetrySource) -> Iterator[TelemetrySample]:

@@ -83,7 +83,7 @@ class RosbagCamera:
             self._facts["topic"] = f"{self.topic} is used; {also}"
 
     def sources(self) -> dict[str, str]:
-        """Of calibration, topic and white."""
+        """Sources of calibration, topic and white."""
         return self._facts | self._white.sources
 
     @property

@@ -67,7 +67,8 @@ class SyntheticDive(ImageFolder):
         return cls(path, fps)
 
     def stated_mounting(self) -> MountingConfig | None:
-        """Of the camera, as the dive states it; None where its synth.yaml does not say."""
+        """Stated mounting of the camera, as the dive states it; None where its synth.yaml does not
+        say."""
         try:
             stated = read_mapping(self.folder / MARK, "facts of the dive", "write the dive again")
             return MountingConfig.model_validate(stated["mounting"]["camera"])

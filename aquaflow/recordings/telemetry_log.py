@@ -155,7 +155,7 @@ class DecodedReads:
             yield from self.of(read)
 
     def of(self, read: Read) -> Iterator[TelemetrySample]:
-        """Of one read; one of a link that no device is known for passes the tap."""
+        """Samples of one read; one of a link that no device is known for passes the tap."""
         if self._tap is not None:
             self._tap(read.link, read.arrival_ns, read.data)
         decoder = self._decoders.get(read.link)

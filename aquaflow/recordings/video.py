@@ -86,7 +86,7 @@ class VideoFile:
         return cls(path, fps)
 
     def sources(self) -> dict[str, str]:
-        """Of times, files, pixels and calibration."""
+        """Sources of times, files, pixels and calibration."""
         return dict(self._facts)
 
     @property

@@ -74,6 +74,6 @@ class DenseAdam:
         return self.state[i]
 
     def forget_gradients(self) -> None:
-        """Of all its tensors."""
+        """Gradients of all its tensors."""
         for tensor in self.tensors:
             tensor.grad = None

@@ -36,7 +36,7 @@ class Size:
 
     @property
     def pixels(self) -> int:
-        """Of the picture."""
+        """Number of pixels of the picture."""
         return self.width * self.height
 
     @property

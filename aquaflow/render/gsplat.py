@@ -231,7 +231,7 @@ def gpu_here() -> Gpu | str:
 
 
 def usable_share(device: torch.device) -> float | None:
-    """Of the device's memory, what new tensors may have, in [0, 1].
+    """Share of the device's memory, what new tensors may have, in [0, 1].
 
     None on the CPU, for a device that is gone, and for a GPU without memory of its own (a
     Jetson's): there it is the machine's that runs short.

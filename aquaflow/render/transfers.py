@@ -64,7 +64,7 @@ def moves_in(
     values: Tensor,  # [...] on the host
     device: torch.device,
 ) -> Tensor:
-    """By which similarities keyframes have moved."""
+    """The similarities by which keyframes have moved."""
     return _into("moves in", values, device)
 
 

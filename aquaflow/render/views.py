@@ -218,7 +218,7 @@ class View:
 
 
 def in_time(views: Iterable[View]) -> list[View]:
-    """In the order of their frames; the first views of a map come in another."""
+    """The views in the order of their frames; the first views of a map come in another."""
     return sorted(views, key=lambda view: view.frame_index)
 
 

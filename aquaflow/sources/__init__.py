@@ -62,7 +62,7 @@ class StatesMounting(Protocol):
     """A source of frames that knows how its camera sits in the vehicle."""
 
     def stated_mounting(self) -> MountingConfig | None:
-        """Of the camera in the body; None if it is not stated.
+        """Stated mounting of the camera in the body; None if it is not stated.
 
         Raises:
             InputError, ConfigError: what states it cannot be read.

@@ -40,7 +40,7 @@ class ReefFiles(Deliverable):
     stage = "reef numbers"
 
     def make(self, dive: Dive, until: Deadline) -> None:
-        """Of the largest sub-map."""
+        """Files of the largest sub-map."""
         write_reef_numbers(dive.path, numbers_at_the_end(dive, until))
 
 
@@ -51,9 +51,9 @@ class Report(Deliverable):
     stage = "report"
 
     def refresh(self, dive: Dive) -> None:
-        """Of the moment."""
+        """Write the report of the moment."""
         write_report(dive.file("report.html"), report_of(dive))
 
     def make(self, dive: Dive, until: Deadline) -> None:
-        """Of everything."""
+        """Write the report of everything."""
         self.refresh(dive)

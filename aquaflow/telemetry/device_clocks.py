@@ -110,7 +110,7 @@ class DeviceClockEstimate:
 
 @dataclass(frozen=True)
 class DeviceClocks:
-    """Of all devices of a dive."""
+    """Clocks of all devices of a dive."""
 
     own: Mapping[str, DeviceClockEstimate]
     """By device, of those with a gyro or an attitude."""
@@ -121,7 +121,7 @@ class DeviceClocks:
         path: CameraPath,
         R_cb: Array | None,  # [3, 3] body to camera
     ) -> DeviceClocks:
-        """As ``path`` and the devices' rotations show them."""
+        """The clocks as ``path`` and the devices' rotations show them."""
         rates, attitudes = telemetry.of(AngularRate), telemetry.of(Attitude)
         devices = sorted({device_of(series.source) for series in (*rates, *attitudes)})
         pieces = _pieces(path)
@@ -142,7 +142,7 @@ class DeviceClocks:
 
     @property
     def reference(self) -> DeviceClockEstimate:
-        """Of the device that shows most, for those that show nothing."""
+        """Clock of the device that shows most, for those that show nothing."""
         nothing = DeviceClockEstimate("", reason="no device has a gyro or an attitude")
         return max(self.own.values(), key=lambda clock: len(clock.at_s), default=nothing)
 

@@ -144,7 +144,7 @@ class AltitudeFactor(Factor):
 
     @property
     def rough_log_scale(self) -> float:
-        """Of metres per map unit, from the median of the ratios."""
+        """Log scale of metres per map unit, from the median of the ratios."""
         return float(np.log(np.median(self._altitude_m / self._range)))
 
     def residuals(self, state: MetricState) -> Array:
@@ -241,7 +241,7 @@ class TiltFactor(Factor):
 
     @staticmethod
     def of_attitude(attitude: Series, path: CameraPath) -> TiltFactor:
-        """From an attitude filter."""
+        """The factor from an attitude filter."""
         attitude = attitude.thin(MOST)
         R_nb = rotation_from_quaternion(attitude.values)
         return TiltFactor(attitude.source, attitude.t_s, R_nb[:, 2, :], path, TILT_SIGMA)
@@ -269,7 +269,7 @@ class ForceFactor(TiltFactor):
 
     @staticmethod
     def of_force(force: Series, path: CameraPath) -> ForceFactor | None:
-        """From an accelerometer; None if nothing of it looks like gravity."""
+        """The factor from an accelerometer; None if nothing of it looks like gravity."""
         norm = np.linalg.norm(force.values, axis=1)
         sound = (norm > LEAST_FORCE) & (norm < MOST_FORCE)
         if not sound.any():

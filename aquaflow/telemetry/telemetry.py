@@ -34,7 +34,7 @@ class Series:
         return Series(self.source, self.t_s[chosen], self.values[chosen])
 
     def thin(self, most: int) -> Series:
-        """At most so many samples, evenly chosen."""
+        """The series with at most so many samples, evenly chosen."""
         step = max(1, -(-len(self) // most))
         return Series(self.source, self.t_s[::step], self.values[::step])
 

@@ -96,7 +96,7 @@ class OffsetFit:
 
     @property
     def correlation(self) -> float:
-        """Of the rates seen and predicted, about their means: 1 is perfect."""
+        """Correlation of the rates seen and predicted, about their means: 1 is perfect."""
         seen = self.seen[self.used]
         predicted = seen - self.residual[self.used]
         a, b = (values - values.mean(axis=0) for values in (seen, predicted))

@@ -40,7 +40,7 @@ class Trust(IntEnum):
 
     @staticmethod
     def of(source: str) -> Trust:
-        """By the message that the source's name ends in, as drivers name them."""
+        """Trust by the message that the source's name ends in, as drivers name them."""
         message = source.rpartition("/")[2]
         if message in GNSS_MESSAGES:
             return Trust.GNSS

@@ -118,7 +118,7 @@ class WorldFrame:
 
     @property
     def unit(self) -> str:
-        """Of lengths in n."""
+        """Unit of lengths in n."""
         return "m" if self.metric else "map units"
 
     @property

@@ -472,11 +472,11 @@ class Base:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         return self.folder.resolve().name
 
     def frame(self, sub_map: int) -> WorldFrame:
-        """Of a sub-map; the unknown one where there is none."""
+        """The metric frame of a sub-map; the unknown one where there is none."""
         return self.frames.get(sub_map, WorldFrame.unknown())
 
     def refuse_other_prior(self, prior: str) -> None:

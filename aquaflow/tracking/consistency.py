@@ -117,7 +117,7 @@ class ConsistencyCounts:
         ]
 
     def to_json(self) -> dict[str, object]:
-        """For /health and metrics.json."""
+        """The counts for /health and metrics.json."""
         return {
             "checks": self.checks,
             "found": self.found,

@@ -217,8 +217,8 @@ LEAST_INFORMATION = 1e-6
 def log_odds_clear(
     fit: WaterFit,  # with water
 ) -> float:
-    """Of clear water against the water of the fit's prior: what the observations say of log beta_a
-    under the prior of the one and of the other, all as normal distributions."""
+    """Log odds of clear water against the water of the fit's prior: what the observations say of
+    log beta_a under the prior of the one and of the other, all as normal distributions."""
     found, start = fit.x[:3], fit.problem.start[:3]
     wet = RATE_ROWS.T @ RATE_ROWS
     posterior = np.linalg.inv(attenuation_covariance(fit))

@@ -369,7 +369,7 @@ class WaterModel(WaterUnknowns):
         weight: Array,  # [M] of the channel, that its J were found with
         c: int,
     ) -> Derivatives:
-        """Of :meth:`predict`'s errors and J, the weights held."""
+        """Derivatives of :meth:`predict`'s errors and J, the weights held."""
         seen, a, trial = self.seen, now.a[c], now.trial
         light = a * now.J[c, seen.point]
         lit = light + now.backscatter[c]

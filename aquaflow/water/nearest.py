@@ -88,7 +88,7 @@ def white_balance(
     J: Array,  # [3, P] colours of the scene
     relative_sigma: Sequence[float],  # [3] of the attenuation
 ) -> WhiteBalance:
-    """By which the mean colour of what is nearest stays as the camera saw it."""
+    """The white balance by which the mean colour of what is nearest stays as the camera saw it."""
     clean = water.without_water(trial, near.view, near.xy, near.z, near.colour)
     red, green, blue = np.maximum(J.mean(axis=1), LEAST_MEAN).tolist()
     return WhiteBalance(

@@ -59,7 +59,7 @@ class Observations:
 
     @cached_property
     def median_range(self) -> float:
-        """Of the surface, map units."""
+        """Median range of the surface, map units."""
         return float(np.median(self.z[self.point < self.surface]))
 
     @property

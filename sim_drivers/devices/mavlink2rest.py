@@ -49,7 +49,7 @@ class Mavlink2restWire:
 
     @property
     def port(self) -> int:
-        """That it listens on."""
+        """The port that it listens on."""
         return int(self._server.server_address[1])
 
     @property

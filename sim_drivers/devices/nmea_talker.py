@@ -27,7 +27,7 @@ CLOCK = "120000.00"
 
 
 def sentence(body: str) -> bytes:
-    """With its checksum, the exclusive or of all characters."""
+    """The sentence with its checksum, the exclusive or of all characters."""
     checksum = reduce(lambda sofar, byte: sofar ^ byte, body.encode(), 0)
     return f"${body}*{checksum:02X}\r\n".encode()
 

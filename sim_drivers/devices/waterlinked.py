@@ -15,7 +15,7 @@ NO_BOTTOM_M = -1.0
 
 
 def line(body: str) -> bytes:
-    """With its CRC-8: polynomial 0x07, start 0."""
+    """The line with its CRC-8: polynomial 0x07, start 0."""
     crc = 0
     for byte in body.encode():
         crc ^= byte

@@ -83,7 +83,7 @@ class UdpWire:
 
     @property
     def port(self) -> int:
-        """That it sends from."""
+        """The port that it sends from."""
         return int(self._socket.getsockname()[1])
 
     def send(self, packet: bytes) -> None:
@@ -113,7 +113,7 @@ class TcpWire:
 
     @property
     def port(self) -> int:
-        """That it listens on."""
+        """The port that it listens on."""
         return int(self._server.getsockname()[1])
 
     def unplug(self) -> None:

@@ -86,7 +86,7 @@ def clock_is_set(root: Path = Path("/"), now_s: Callable[[], float] = time.time)
 
 
 def kernel_is_synchronised() -> bool:
-    """As adjtimex(2) says; False where a sandbox forbids to ask."""
+    """What adjtimex(2) says; False where a sandbox forbids to ask."""
     try:
         answer = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
     except (AttributeError, OSError):

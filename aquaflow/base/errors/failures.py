@@ -75,7 +75,7 @@ class Kind:
     count: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """For metrics.json and /health."""
+        """The failure as metrics.json and /health have it."""
         return {
             "stage": self.stage,
             "error": self.error,
@@ -188,7 +188,7 @@ class Failures:
         return [kind.note() for kind in self.kinds]
 
     def to_json(self) -> list[dict[str, Any]]:
-        """For metrics.json: an object for each kind."""
+        """The failures as metrics.json has them: an object for each kind."""
         return [kind.to_json() for kind in self.kinds]
 
 

@@ -47,12 +47,12 @@ class BatchJob:
     version: str = __version__
 
     def digest(self) -> str:
-        """Of what the dive's bytes depend on, but for the machine and AquaFlow's version."""
+        """Digest of what the dive's bytes depend on, but for the machine and AquaFlow's version."""
         known = [self.name, self.size_bytes, self.settings, self.calibration]
         return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
     def to_json(self) -> dict[str, Any]:
-        """For :meth:`of_json` on another machine."""
+        """The job for :meth:`of_json` on another machine."""
         return asdict(self)
 
     @classmethod
@@ -86,7 +86,7 @@ class BatchOutcome:
     """The dive was there before; nothing was done."""
 
     def to_json(self) -> dict[str, Any]:
-        """For :meth:`of_json` on another machine, the journal and the table."""
+        """The outcome for :meth:`of_json` on another machine, the journal and the table."""
         return asdict(self)
 
     @classmethod

@@ -71,7 +71,7 @@ class ObjectStore:
         return sorted(found, key=lambda entry: entry.name)
 
     def size_bytes(self) -> int:
-        """Of the file, or of everything in the folder.
+        """Size of the file, or of everything in the folder.
 
         Raises:
             StoreError: there is nothing.

@@ -45,7 +45,7 @@ class BenchJob:
         return parse_config(merge(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
 
     def to_text(self) -> str:
-        """As JSON, for the worker process."""
+        """The job as JSON, for the worker process."""
         return json.dumps(asdict(self))
 
     @staticmethod

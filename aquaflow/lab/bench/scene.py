@@ -34,7 +34,7 @@ class BenchmarkScene:
     """Of a preset's refining steps: small pictures converge sooner."""
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """The scene as plain values."""
         return asdict(self)
 
 

@@ -49,7 +49,7 @@ class SummaryLine:
         return [row["failed"] for row in self.rows if row["failed"]]
 
     def spread(self, column: Column) -> Spread | None:
-        """Of the runs that did not fail; None if none has a value."""
+        """Spread of the runs that did not fail; None if none has a value."""
         values = [column.value(row) for row in self.rows if not row["failed"]]
         known = [value for value in values if value is not None]
         if not known:

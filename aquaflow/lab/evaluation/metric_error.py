@@ -46,7 +46,7 @@ class MetricError:
     """After alignment by yaw and translation alone."""
 
     def to_json(self) -> dict[str, float | None]:
-        """As plain values with the names above."""
+        """The errors as plain values with the names above."""
         return asdict(self)
 
 
@@ -153,7 +153,7 @@ class MediumError:
     """False if the dive found the water clear and modelled none."""
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values with the names above."""
+        """The errors as plain values with the names above."""
         return asdict(self)
 
 

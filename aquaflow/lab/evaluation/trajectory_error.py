@@ -42,7 +42,7 @@ class RelativeError:
     pairs: int
 
     def to_json(self) -> dict[str, float | int | None]:
-        """As plain values with the names above."""
+        """The errors as plain values with the names above."""
         return asdict(self)
 
 

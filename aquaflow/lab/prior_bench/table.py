@@ -114,7 +114,7 @@ WHOLLY = 0.999
 
 @dataclass(frozen=True)
 class PairFigures:
-    """Of one method on one pair."""
+    """Figures of one method on one pair."""
 
     matches: int
     precision: float

@@ -30,7 +30,7 @@ class RandomGaussians:
     colours: Tensor
 
     def tensors(self) -> list[Tensor]:
-        """In the order of the renderer's arguments."""
+        """Tensors in the order of the renderer's arguments."""
         return [self.means, self.quats, self.scales, self.opacities, self.colours]
 
 

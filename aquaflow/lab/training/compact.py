@@ -98,7 +98,7 @@ class CompactTask:
         return next(self.network.parameters()).device
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Of step number ``step``, and its terms."""
+        """Loss of step number ``step``, and its terms."""
         draw = Draw(self.seed * STRIDE + step, self.device)
         settings = self.settings
         known = settings.first_scenes + step // settings.steps_per_shard * SHARD

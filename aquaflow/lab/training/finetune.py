@@ -159,11 +159,12 @@ class FineTuning:
 
     @property
     def batches_per_epoch(self) -> int:
-        """Of each process; the rest of an epoch is left out, another one each time."""
+        """Number of batches of each process; the rest of an epoch is left out, another one each
+        time."""
         return len(self._trained) // (self._settings.batch * self._process.count)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Of this process's batch number ``step``."""
+        """Loss of this process's batch number ``step``."""
         losses = self._losses(self._numbers(step), self._settings.seed + step)
         return losses.total, _terms(losses)
 

@@ -41,7 +41,7 @@ class Task(Protocol):
         ...
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Of the batch that ``step`` stands for, and the terms it is made of."""
+        """Loss of the batch that ``step`` stands for, and the terms it is made of."""
         ...
 
     def validate(self) -> dict[str, float]:
@@ -244,7 +244,7 @@ class Schedule:
     it, and is resumed with the length that there turned out to be time for."""
 
     def rate(self, step: int) -> float:
-        """Of the optimiser's step number ``step``, counted from 0."""
+        """Learning rate of the optimiser's step number ``step``, counted from 0."""
         if step < self.warm_up:
             return self.highest * (step + 1) / self.warm_up
         begins = self.warm_up + self.hold
@@ -279,7 +279,7 @@ class TrainingProcess:
         """Replace every gradient by its mean over the processes."""
 
     def wait(self) -> None:
-        """Until every process is here."""
+        """Wait until every process is here."""
 
 
 class DistributedProcess(TrainingProcess):
@@ -304,7 +304,7 @@ class DistributedProcess(TrainingProcess):
             parameter.grad /= self.count
 
     def wait(self) -> None:
-        """Until every process is here."""
+        """Wait until every process is here."""
         dist.barrier()
 
 

@@ -40,7 +40,7 @@ def localise_in_base(slam: Slam, asked: Path | None, checkpoint: Checkpoint | No
 
 
 def unreadable(number: int) -> KeypointDepths:
-    """Of a dive that cannot be read any more.
+    """The message of a dive that cannot be read any more.
 
     Raises:
         InputError: always.

@@ -38,13 +38,13 @@ class ServiceState(str, Enum):
 
     @property
     def number(self) -> int:
-        """For NAMED_VALUE_FLOAT and Prometheus."""
+        """The state as a number, for NAMED_VALUE_FLOAT and Prometheus."""
         return list(ServiceState).index(self)
 
 
 @dataclass(frozen=True)
 class Change:
-    """From one state to another, and why."""
+    """A change from one state to another, and why."""
 
     t_s: float
     """CLOCK_MONOTONIC."""
@@ -193,19 +193,19 @@ NOT_RECORDING = "AquaFlow does not record any more."
 
 
 def no_picture(camera: str) -> str:
-    """Of a camera that sends nothing."""
+    """Reason of a camera that sends nothing."""
     return _fitting(f"AquaFlow: no picture from camera {camera}.", OF_STATE[ServiceState.WAITING])
 
 
 def silent_link(name: str, heard_before: bool) -> str:
-    """Of a link that was lost, or that was never heard."""
+    """Reason of a link that was lost, or that was never heard."""
     if heard_before:
         return _fitting(f"AquaFlow: link {name} is lost.", "AquaFlow: a link is lost.")
     return _fitting(f"AquaFlow: nothing heard of {name}.", "AquaFlow: a link is silent.")
 
 
 def doing_less(level: DegradationLevel, shortage: Shortage) -> str:
-    """Of a service that sheds load."""
+    """Reason of a service that sheds load."""
     return f"AquaFlow: {OF_SHORTAGE[shortage]}, {OF_LEVEL[level]}."
 
 

@@ -24,7 +24,7 @@ LEAST_COSINE = 0.1
 
 @dataclass(frozen=True)
 class BodyPoseInWorld:
-    """Of the body in the world n: north-east-down, or along the initial heading."""
+    """Pose of the body in the world n: north-east-down, or along the initial heading."""
 
     R: Array
     """[3, 3] body to n."""

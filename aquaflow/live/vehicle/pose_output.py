@@ -100,7 +100,7 @@ class PoseOutput:
             self.withheld[self.reason] += 1
 
     def to_json(self) -> dict[str, Any]:
-        """For /health."""
+        """Counts for /health."""
         return {
             "sent": self.sent,
             "jumps": self.jumps,

@@ -56,7 +56,7 @@ class CompactDecoderGraph(nn.Module):
         rays_a: Tensor,  # [1, 2, h, w]
         rays_b: Tensor,  # [1, 2, h', w']
     ) -> tuple[Tensor, ...]:
-        """As OUTPUTS."""
+        """The outputs, as OUTPUTS names them."""
         one, other = self.comparison(Dc_a, Dc_b, rays_a, rays_b)
         return (*one, *other)
 

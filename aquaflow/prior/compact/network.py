@@ -145,7 +145,7 @@ class CompactDecoder(nn.Module):
         rays_a: Tensor,  # [B, 2, h, w] x / z, y / z of the cells' centres
         rays_b: Tensor,  # [B, 2, h, w]
     ) -> tuple[Compared, Compared]:
-        """From a to b, and from b to a."""
+        """Outputs from a to b, and from b to a."""
         # Products of unit descriptors are at most 1, so no exponential is above 1.
         sharpness = self.sharpness.clamp_max(SHARPEST).exp()
         alike = torch.exp(self.scores(Dc_a, Dc_b) - sharpness)

@@ -225,7 +225,7 @@ class XFeat:
         self,
         picture: Picture,  # [H, W, 3] RGB
     ) -> Keypoints:
-        """At whole pixels of the network's picture."""
+        """Keypoints at whole pixels of the network's picture."""
         image = torch.from_numpy(np.ascontiguousarray(picture)).to(self._device)
         found = self._network.detectAndCompute(image.permute(2, 0, 1)[None].float() / 255.0)[0]
         if len(found["keypoints"]) == 0:

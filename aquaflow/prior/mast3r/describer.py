@@ -66,7 +66,7 @@ class Mast3rDescriber:
         camera_a: CameraModel,
         camera_b: CameraModel,
     ) -> Mast3rPair:
-        """Of the cameras only the pictures' sizes: the network finds the rest itself."""
+        """Comparison of the cameras only the pictures' sizes: the network finds the rest itself."""
         framings = (self._framing(camera.height, camera.width) for camera in (camera_a, camera_b))
         return Mast3rPair(self, a, b, *framings)
 

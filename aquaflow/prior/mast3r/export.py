@@ -56,7 +56,7 @@ class Mast3rDecoderGraph(nn.Module):
         a: Tensor,  # [1, N, D]
         b: Tensor,  # [1, N, D]
     ) -> tuple[Tensor, ...]:
-        """As OUTPUTS."""
+        """The outputs, as OUTPUTS names them."""
         first, second = self.network.decode(a, b, self.rows, self.columns)
         return (*first, *second)
 

@@ -45,7 +45,7 @@ class PlaceColours:
 
 @dataclass(frozen=True)
 class ColourChange:
-    """Of each place; NaN where one of the days shows none."""
+    """Colour change of each place; NaN where one of the days shows none."""
 
     lighter: Array
     """[N] natural log of the brightness over that of the first day, without what all share."""
@@ -92,7 +92,7 @@ def shown_at(
 
 
 def colour_change(first: PlaceColours, second: PlaceColours) -> ColourChange:
-    """From the first day to the second."""
+    """The colour change from the first day to the second."""
     both = np.isfinite(first.mean).all(axis=1) & np.isfinite(second.mean).all(axis=1)
     lit = both & (first.mean > DARKEST).all(axis=1) & (second.mean > DARKEST).all(axis=1)
     gains = np.ones(3)

@@ -121,7 +121,7 @@ def hull_of(
 
 @dataclass(frozen=True)
 class Move:
-    """From where a thing stood to where it stands, in cells."""
+    """A move from where a thing stood to where it stands, in cells."""
 
     cells: Array
     """[2] rows, columns."""

@@ -38,7 +38,7 @@ class CoverageFiles(Deliverable):
                 self.coverage.update()
 
     def refresh(self, dive: Dive) -> None:
-        """As it is at the moment."""
+        """Write the coverage as it is at the moment."""
         if self.coverage is not None:
             write_coverage(dive.path, self._views(self.coverage, dive), dive.main)
 
@@ -72,7 +72,7 @@ def write_coverage(dive: Path, views: Mapping[int, PageView], main: int) -> None
 
 
 def numbers(view: PageView) -> dict[str, Any]:
-    """Of one sub-map, in the unit of its metric frame."""
+    """Numbers of one sub-map, in the unit of its metric frame."""
     state, limit = view.state, view.plan.limit
     return {
         "unit": view.unit,

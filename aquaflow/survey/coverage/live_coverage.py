@@ -106,7 +106,8 @@ class LiveCoverage(CoverageView):
         return tuple(SENTENCES[hint] for hint in self.hints)
 
     def to_json(self) -> dict[int, dict[str, Any]]:
-        """By sub-map: the picture of the cells and how it lies on the page, lines and areas."""
+        """What the page shows, by sub-map: the picture of the cells and how it lies on the page,
+        lines and areas."""
         return {number: describe(view) for number, view in self._views.items()}
 
     def in_words(self) -> list[str]:
@@ -213,7 +214,7 @@ def coverage_of(dive: RunningDive) -> DiveCoverage | None:
 
 
 def describe(view: PageView) -> dict[str, Any]:
-    """For the page: lengths in the view's unit, places right and up."""
+    """The plan for the page: lengths in the view's unit, places right and up."""
     state, plan = view.state, view.plan
     suggestion = state.suggestion
     return {

@@ -39,7 +39,7 @@ class PageView:
     state: LineState
 
     def area(self, seen: CoverageClass) -> float:
-        """Of a class, in the square of ``unit``."""
+        """Area of a class, in the square of ``unit``."""
         return self.plan.area(seen) * self.scale**2
 
     def rescale(self, times: float, unit: str) -> PageView:

@@ -48,7 +48,7 @@ class CoveragePlan:
     """Cells of side ``frame.cell`` of each class, of the whole grid."""
 
     def area(self, seen: CoverageClass) -> float:
-        """Of a class, in square map units."""
+        """Area of a class, in square map units."""
         return self.cells.get(seen, 0) * self.frame.cell**2
 
     def places(

@@ -211,7 +211,7 @@ class Tiles:
 
     @property
     def nbytes(self) -> int:
-        """Of all counts."""
+        """Memory of all counts."""
         return len(self.tiles) * TILE_BYTES
 
 

@@ -68,7 +68,7 @@ class SubMapCoverage:
 
     @property
     def seen(self) -> Mapping[int, Sight]:
-        """By keyframe, as it is now: footprint and T_mc."""
+        """What each keyframe has seen, as it is now: footprint and T_mc."""
         return self._seen
 
     @property

@@ -39,7 +39,7 @@ class SurveyLine:
 
     @property
     def length(self) -> float:
-        """From start to end."""
+        """Length from start to end."""
         return float(np.linalg.norm(self.end - self.start))
 
     @property

@@ -68,7 +68,7 @@ class PointMeasurements:
         return data
 
     def rows(self) -> list[list[str]]:
-        """As a table with a head: the profile's heights, or the quantities."""
+        """A table with a head: the profile's heights, or the quantities."""
         if self.profile is not None:
             found = self.profile
             values = np.stack([found.along, found.height, found.sigma, found.low, found.high], 1)

@@ -29,7 +29,7 @@ _ON_EARTH = re.compile(r"([\d.]+)([NS]),([\d.]+)([EW])")
 
 @dataclass(frozen=True)
 class Pixel:
-    """Of a mapped picture."""
+    """A pixel of a mapped picture."""
 
     frame: int
     u: float
@@ -38,7 +38,7 @@ class Pixel:
 
 @dataclass(frozen=True)
 class MapPoint:
-    """In n."""
+    """A point in n."""
 
     x: float
     y: float
@@ -47,7 +47,7 @@ class MapPoint:
 
 @dataclass(frozen=True)
 class GeodeticPoint:
-    """On the earth, degrees."""
+    """A point on the earth, degrees."""
 
     latitude: float
     longitude: float

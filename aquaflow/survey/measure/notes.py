@@ -49,7 +49,7 @@ class Note:
     """What else goes into the file, such as a measured length; JSON values alone."""
 
     def to_json(self) -> dict[str, Any]:
-        """For machines: places [N, 3] in n and the dive's unit."""
+        """The note for machines: places [N, 3] in n and the dive's unit."""
         return {
             "key": self.key, "text": self.text, "shape": self.shape,
             "places": np.asarray(self.places).tolist(), "properties": self.properties,

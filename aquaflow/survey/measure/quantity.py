@@ -26,7 +26,7 @@ class Quantity:
 
     @staticmethod
     def normal(value: float, sigma: float, unit: str, least: float = 0.0) -> Quantity:
-        """With a normal error; nothing below ``least`` is possible."""
+        """A quantity with a normal error; nothing below ``least`` is possible."""
         half = NORMAL_95 * sigma
         return Quantity(value, sigma, max(least, value - half), value + half, unit)
 
@@ -86,12 +86,12 @@ class Scale:
 
     @property
     def square_unit(self) -> str:
-        """Of areas."""
+        """Unit of areas."""
         return "m\u00b2" if self.unit == "m" else f"square {self.unit}"
 
 
 def scale_of(frame: WorldFrame) -> Scale:
-    """Of the lengths in n of a sub-map."""
+    """Scale of the lengths in n of a sub-map."""
     return Scale(
         frame.unit,
         frame.scale_sigma if frame.metric else 0.0,

@@ -187,7 +187,7 @@ class Pages:
         self._text(text, 20.0, 0.45, weight="bold", letters=45)
 
     def heading(self, text: str, keep_in: float = 1.0) -> None:
-        """Of a section; it stays with so many inches of what follows."""
+        """Heading of a section; it stays with so many inches of what follows."""
         self._room(keep_in + HEADING_IN)
         self._y -= 0.12
         self._text(text, 12.0, 0.28, weight="bold", letters=80)

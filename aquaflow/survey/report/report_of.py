@@ -205,7 +205,7 @@ def left_out(rows: Iterable[FrameRow]) -> list[LeftOut]:
 
 
 def measures(path: PathPlot, frame: WorldFrame, water: MediumCurves | None) -> Measures:
-    """Of the path in n, the largest sub-map's ``frame``, and the water in its unit."""
+    """Measures of the path in n, the largest sub-map's ``frame``, and the water in its unit."""
     rows = [
         ("unit of length", _unit(frame)),
         ("scale from", frame.scale_source),

@@ -142,7 +142,7 @@ METHOD = 2
 
 
 def link_file(site: Path, a: SiteDive, b: SiteDive) -> Path:
-    """Of the links between two dives."""
+    """The file of the links between two dives."""
     return site / FOLDER / f"{a.fingerprint[:16]}_{b.fingerprint[:16]}.json"
 
 

@@ -58,12 +58,12 @@ class FinishedDive:
 
     @property
     def palettes(self) -> dict[str, Palette]:
-        """Of the splats' levels."""
+        """Palettes of the splats' levels."""
         return self.map().palettes if self.packed is None else self.packed.palettes
 
     @property
     def summary(self) -> str:
-        """For the panel: paragraphs."""
+        """Paragraphs for the panel."""
         if self.packed is None:
             count, total = len(self.map().splats), self.map().total
         else:

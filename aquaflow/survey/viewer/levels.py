@@ -41,7 +41,7 @@ class Palette:
     unit: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """By the names that the page uses."""
+        """The palette by the names that the page uses."""
         return {
             "label": self.label, "stops": self.stops, "words": self.words,
             "largest": self.largest, "unit": self.unit,

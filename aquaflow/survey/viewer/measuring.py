@@ -42,13 +42,13 @@ class LengthUnit:
 
     @staticmethod
     def of(frame: WorldFrame) -> LengthUnit:
-        """Of a finished dive, whose files are in n."""
+        """Unit of a finished dive, whose files are in n."""
         return LengthUnit(scale_of(frame), level=frame.level)
 
 
 @dataclass(frozen=True)
 class MeasuringScene:
-    """Where points are measured."""
+    """A scene in which points are measured."""
 
     splats: ViewerSplats
     cameras: Array

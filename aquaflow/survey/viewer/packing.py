@@ -59,7 +59,7 @@ class _Code:
 
     @staticmethod
     def of(splats: ViewerSplats) -> _Code:
-        """For these Gaussians."""
+        """The code for these Gaussians."""
         middle, half = _box(splats.centres)
         return _Code(middle, half, _log_scales(splats.scales), _brightest(splats.colours))
 
@@ -134,7 +134,7 @@ class Packed:
 
 
 def bytes_of_each(levels: int) -> int:
-    """Of a Gaussian in a chunk, before gzip: six for its place, four, three, one and three."""
+    """Bytes of a Gaussian in a chunk, before gzip: six for its place, four, three, one and three."""
     return 17 + levels
 
 

@@ -28,7 +28,7 @@ class SeenWater:
     """From which most of the map was seen: a browser looks through that much water at most."""
 
     def to_json(self) -> dict[str, Any]:
-        """By the names that the page uses."""
+        """The water by the names that the page uses."""
         return {
             "beta": self.beta, "B_inf": self.B_inf, "b": self.b, "B_res": self.B_res, "d": self.d,
             "gain": self.gain, "range": self.range,
@@ -56,7 +56,7 @@ def water_of(medium: dict[str, Any]) -> SeenWater | None:
 def seen_water(
     beta: Any, B_inf: Any, b: Any, B_res: Any, d: Any, gain: Any, range_: Any
 ) -> SeenWater:
-    """From anything that is three numbers each.
+    """The water from anything that is three numbers each.
 
     Raises:
         ValueError: a number is not finite, or no gain or range.

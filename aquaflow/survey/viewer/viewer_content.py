@@ -77,7 +77,7 @@ class PathPart:
     camera: CameraModel
 
     def to_json(self) -> dict[str, Any]:
-        """By the names that the page uses."""
+        """The part by the names that the page uses."""
         began = None if self.began is None else self.began.isoformat()
         return {"name": self.name, "first": self.first, "began": began, **_optics(self.camera)}
 

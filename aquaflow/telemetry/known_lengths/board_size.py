@@ -265,7 +265,7 @@ class BoardSighting:
 
     @property
     def name(self) -> str:
-        """For the report."""
+        """Name for the report."""
         return f"board {self.board}" if self.marker is None else f"marker {self.marker}"
 
 

@@ -65,7 +65,7 @@ class Tally:
     """Of each adjustment, matching included."""
 
     def to_json(self) -> dict[str, float | int | None]:
-        """As metrics.json has it."""
+        """The tally as metrics.json has it."""
         times = np.array(self.cpu_ms)
         mean, p95 = (
             (round(float(each), 1) for each in (times.mean(), np.percentile(times, 95)))

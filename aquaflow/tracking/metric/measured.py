@@ -263,7 +263,7 @@ class World:
 
     @property
     def number(self) -> int:
-        """Of its node: negative, and no other's."""
+        """Number of its node: negative, and no other's."""
         return -2 - 2 * self.component if self.of_base else -1 - 2 * self.component
 
     @property
@@ -273,5 +273,5 @@ class World:
 
     @staticmethod
     def at(component: int, frame: WorldFrame, edges: Sequence[WorldEdge]) -> World:
-        """At the frame that the estimator found."""
+        """The world at the frame that the estimator found."""
         return World(component, frame.T_nm.inverse(), edges)

@@ -238,8 +238,8 @@ class LearnedScales:
     """Takes part in the graph's optimisations, as telemetry does."""
 
     def __init__(self, keyframes: KeyframeStore, unit_sigma: float) -> None:
-        """Of keyframes whose pointmaps say what the network's unit is; ``unit_sigma`` is what that
-        may differ by from one part of a dive to another (`Prior.unit_sigma`)."""
+        """Scales of keyframes whose pointmaps say what the network's unit is; ``unit_sigma`` is
+        what that may differ by from one part of a dive to another (`Prior.unit_sigma`)."""
         self._keyframes, self._unit_sigma = keyframes, unit_sigma
         self._known: dict[int, tuple[float, float]] = {}
         """By keyframe: logarithm of its unit over the network's, and 1 sigma."""

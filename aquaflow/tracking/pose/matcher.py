@@ -321,7 +321,7 @@ def visibility(
     T_fk: Sim3,
     camera: CameraModel,
 ) -> Visibility:
-    """Of the points of ``pointmap`` at ``looked_at`` pixels, all of known depth.
+    """Visibility of the points of ``pointmap`` at ``looked_at`` pixels, all of known depth.
 
     Where the frame should show none of them, none of them is missing.
     """

@@ -108,7 +108,7 @@ class _PoseDescent:
         return self._last[1]
 
     def cost(self, T: Sim3) -> float:
-        """Of the weighted, whitened Huber loss."""
+        """Cost of the weighted, whitened Huber loss."""
         return self.linearise(T).cost
 
     def move(

@@ -34,7 +34,7 @@ class GrowthJob:
         return load_configured(None, self.preset, asked, "benchmark of growth")
 
     def to_text(self) -> str:
-        """As JSON, for the process."""
+        """The job as JSON, for the process."""
         return json.dumps(asdict(self))
 
     @staticmethod

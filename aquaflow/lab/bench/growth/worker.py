@@ -124,13 +124,13 @@ def _get(address: str) -> bytes:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Of all files in ``folder`` and below."""
+    """Size of all files in ``folder`` and below."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def checkpoint_bytes(slam: Slam, scratch: Path) -> int:
-    """Of what a live dive's checkpoint would hold now; written to the file ``scratch``, which is
-    removed again.
+    """Size of what a live dive's checkpoint would hold now; written to the file ``scratch``, which
+    is removed again.
 
     Raises:
         InputError: it cannot be written.

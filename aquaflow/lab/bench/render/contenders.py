@@ -35,7 +35,7 @@ class BenchmarkedRenderer(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the renderer or program, for the table."""
+        """Name of the renderer or program, for the table."""
         ...
 
     @property
@@ -74,17 +74,17 @@ class Timed:
 
     @property
     def name(self) -> str:
-        """Of the renderer."""
+        """Name of the renderer."""
         return self.renderer.name
 
     @property
     def isa(self) -> str:
-        """Of the renderer."""
+        """Instruction set of the renderer."""
         return self.renderer.isa
 
     @property
     def threads(self) -> int:
-        """Of the renderer."""
+        """Number of threads of the renderer."""
         return self.renderer.threads
 
     @property
@@ -283,7 +283,7 @@ def covering_scene() -> SplatScene:
 
 
 def measure_blend_limit(isa: str) -> BlendLimit:
-    """By the kernels of ``isa``, on one thread; their own clock, the fastest of ATTEMPTS."""
+    """The limit by the kernels of ``isa``, on one thread; their own clock, the fastest of ATTEMPTS."""
     renderer, scene = CpuRenderer(1, isa), covering_scene()
     leaves, fastest = scene.leaves(), {FORWARD_STAGE: float("inf"), BACKWARD_STAGE: float("inf")}
     with torch_threads(1):

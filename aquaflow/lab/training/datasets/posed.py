@@ -42,7 +42,7 @@ class Sequence(Protocol):
 
     @property
     def name(self) -> str:
-        """For messages and figures."""
+        """Name for messages and figures."""
         ...
 
     def __len__(self) -> int: ...

@@ -28,7 +28,7 @@ class TriangleMesh:
         return np.asarray(np.cross(b - a, c - a))
 
     def area(self) -> float:
-        """Of all triangles."""
+        """Area of all triangles."""
         return float(0.5 * np.linalg.norm(self.face_vectors(), axis=1).sum())
 
     def normals(self) -> Array:

@@ -70,7 +70,7 @@ class Grid:
         return Grid(float(left), float(top), pixel, int(sides[0]), int(sides[1]))
 
     def tiles(self) -> Iterator[GridTile]:
-        """From the top left, row by row."""
+        """The tiles from the top left, row by row."""
         for row in range(0, self.height, TILE_PX):
             for column in range(0, self.width, TILE_PX):
                 yield GridTile(

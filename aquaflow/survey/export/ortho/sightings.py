@@ -39,7 +39,7 @@ bars take it (dive/scale_bar.py)."""
 
 @dataclass(frozen=True)
 class PointSightings:
-    """Of some points, by all views."""
+    """Sightings of some points, by all views."""
 
     count: npt.NDArray[np.int32]
     """[M] views that see the point."""
