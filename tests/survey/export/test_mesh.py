@@ -188,6 +188,14 @@ def test_a_larger_resolution_gives_fewer_triangles(dive: Path, tmp_path: Path) -
     assert 2_000 < coarse.triangles < 8_000
 
 
+@pytest.mark.parametrize("resolution", [0.2, 0.4])
+def test_a_surface_of_few_voxels_is_written(dive: Path, tmp_path: Path, resolution: float) -> None:
+    fine = export_mesh(Dive(dive), tmp_path / "fine.ply", "ply")
+    coarse = export_mesh(Dive(dive), tmp_path / "coarse.ply", "ply", resolution)
+    assert coarse.triangles > 0
+    assert coarse.area == pytest.approx(fine.area, rel=0.35)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_fails_leaves_nothing_behind(
     dive: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch

@@ -40,9 +40,9 @@ MOST_SIGMA_PX = 8.0
 """Sigma of a vertex, from where rays meet, beyond which it is a hole, in widths of a pixel there:
 two rays that cross at 10 degrees leave as much along them. What is seen from less apart is smears;
 on the reef, which is filmed forwards, 11 and 18 leave much of the far ground."""
-LEAST_PIECE_VOXELS = 30.0
-"""Side of the square whose area a piece of the surface has at least; what is smaller is haze or a
-fish."""
+LEAST_PIECE_PX = 60.0
+"""Side of the square whose area a piece of the surface has at least, in widths of a pixel at the
+median range: what is smaller is haze or a fish, however coarse the mesh is wanted."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def fused_surface(views: ViewSurfaces, voxel: float, report: Progress) -> FusedS
     mesh = builder.mesh()
     known = _sigmas(views, mesh, voxel, in_pixels=True) <= MOST_SIGMA_PX
     mesh = mesh.with_faces(np.asarray(known[mesh.faces].all(axis=1)))
-    mesh = mesh.without_small_pieces((LEAST_PIECE_VOXELS * voxel) ** 2)
+    mesh = mesh.without_small_pieces((LEAST_PIECE_PX * views.footprint) ** 2)
     if not len(mesh.faces):
         raise InputError(
             "too little of the map is seen well by two views to make a surface of it; give a "
