@@ -120,7 +120,7 @@ class OwnedMaps(MapWork, Protocol):
         ...
 
     def usable_memory(self) -> float | None:
-        """Share of the device's own memory, what new tensors may have, in [0, 1]; None on the CPU."""
+        """Share of the device's memory that new tensors may have, in [0, 1]; None on the CPU."""
         ...
 
     def save_pictures(self) -> list[Path]:

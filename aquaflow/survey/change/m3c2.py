@@ -68,7 +68,7 @@ class Scales:
 
 @dataclass(frozen=True)
 class SurfaceDistances:
-    """Distances of each core point; NaN where one of the clouds has too few points in the cylinder."""
+    """Distances of each core point; NaN where a cloud has too few points in the cylinder."""
 
     distance: Array
     """[N] along the normal, positive where the second cloud lies towards it."""

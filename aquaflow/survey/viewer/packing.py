@@ -134,7 +134,7 @@ class Packed:
 
 
 def bytes_of_each(levels: int) -> int:
-    """Bytes of a Gaussian in a chunk, before gzip: six for its place, four, three, one and three."""
+    """Bytes of a Gaussian in a chunk, before gzip: 6 for its place, then 4, 3, 1 and 3."""
     return 17 + levels
 
 

@@ -283,7 +283,7 @@ def covering_scene() -> SplatScene:
 
 
 def measure_blend_limit(isa: str) -> BlendLimit:
-    """The limit by the kernels of ``isa``, on one thread; their own clock, the fastest of ATTEMPTS."""
+    """The limit by the kernels of ``isa``, on one thread: the fastest of ATTEMPTS, their clock."""
     renderer, scene = CpuRenderer(1, isa), covering_scene()
     leaves, fastest = scene.leaves(), {FORWARD_STAGE: float("inf"), BACKWARD_STAGE: float("inf")}
     with torch_threads(1):
