@@ -133,7 +133,7 @@ def export(
 
     read = Dive(dive)
     read.require(MAP)
-    target = out or _own_target(dive / NAMES[format])
+    target = _given_target(out) if out else _own_target(dive / NAMES[format])
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:
@@ -172,13 +172,27 @@ def report(
     from aquaflow.survey.report.pdf import write_pdf
     from aquaflow.survey.report.report_of import report_of
 
-    out, of = pdf or dive / REPORT, Dive(dive)
+    of = Dive(dive)
     of.require(FRAMES, METRICS)
+    out = _given_target(pdf) if pdf else dive / REPORT
     pages = write_pdf(out, report_of(of))
     if as_json:
         typer.echo(json.dumps({"pdf": str(out), "pages": pages}))
         return
     typer.echo(f"Wrote {pages} pages to {out}.")
+
+
+def _given_target(path: Path) -> Path:
+    """``path``, with the folders above it made: a file or a folder may be wanted anywhere."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        is_file = isinstance(error, (FileExistsError, NotADirectoryError))
+        reason = f"{path.parent} is no folder" if is_file else error.strerror
+        raise InputError(
+            f"cannot write {path}: {reason}; give a folder with room that can be written to"
+        ) from error
+    return path
 
 
 def _own_target(path: Path) -> Path:
@@ -377,6 +391,7 @@ def video(
 
     read = Dive(dive)
     read.require(MAP)
+    _given_target(out)
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:

@@ -126,12 +126,37 @@ def test_pictures_whose_names_are_not_utf_8_are_mapped(
 # --- folders --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("--format", "laz", "--out"), "points.laz"),
+        (("--format", "e57", "--out"), "points.e57"),
+        (("--format", "spz", "--out"), "map.spz"),
+        (("--format", "mcap", "--out"), "dive.mcap"),
+        (("--format", "ply", "--out"), "mesh.ply"),
+        (("--format", "restored", "--out"), "pictures"),
+        (("report", "--pdf"), "dive.pdf"),
+        (("video", "--kind", "fly-through", "--seconds", "0.2", "--out"), "flight.mp4"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else "",
+)
+def test_the_folder_of_an_output_is_made(
+    command: Cli, small_dive: Path, tmp_path: Path, words: tuple[str, ...], name: str
+) -> None:
+    out = tmp_path / "new" / "folder" / name
+    named = (words[0], small_dive, *words[1:]) if words[0][0] != "-" else (small_dive, *words)
+    ran = command("export", *named, out)
+    assert ran.code == 0, ran.err
+    assert out.exists()
+
+
 def test_an_export_to_where_no_folder_can_be_is_refused(
     command: Cli, small_dive: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "file"
     file.write_text("thesis")
-    for place in (Path("/proc/aquaflow"), file, file / "below"):
-        ran = command("export", small_dive, "--format", "restored", "--out", place)
-        refused(ran, place)
+    for kind in ("restored", "laz"):
+        for place in (Path("/proc/aquaflow/x"), file / "below", file / "far" / "below"):
+            refused(command("export", small_dive, "--format", kind, "--out", place), place)
+    refused(command("export", small_dive, "--format", "restored", "--out", file), file)
     assert file.read_text() == "thesis"
