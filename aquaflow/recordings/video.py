@@ -13,7 +13,7 @@ from aquaflow.base.errors import printable
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
 from aquaflow.recordings.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 from aquaflow.recordings.picture import UnreadablePictureError
-from aquaflow.recordings.video_decoder import VideoDecoder
+from aquaflow.recordings.video_decoder import VideoDecoder, read_index
 from aquaflow.sources import is_asked
 from aquaflow.types import CameraModel, Dropped, Frame
 
@@ -38,8 +38,6 @@ SENSORS = {b"gpmd": "GoPro", b"djmd": "DJI", b"camm": "Google", b"rtmd": "Sony"}
 """Formats of streams in MP4 with what a camera's sensors measured, and whose they are."""
 FORMAT = re.compile(rb"stsd.{12}(.{4})", re.DOTALL)
 """A stream's format in the index of an MP4 (ISO 14496-12, 8.5.2)."""
-LARGEST_INDEX = 1 << 26
-"""Bytes; that of ten hours has as many."""
 
 
 class VideoFile:
@@ -230,17 +228,7 @@ def _chapters(path: Path) -> list[Path]:
 
 def _formats(path: Path) -> list[bytes]:
     """Of the streams of an MP4; none for other files, and for one that is damaged."""
-    with path.open("rb") as file:
-        while len(head := file.read(8)) == 8:
-            size, kind = int.from_bytes(head[:4], "big"), head[4:]
-            if kind == b"moov":
-                return FORMAT.findall(file.read(min(size, LARGEST_INDEX)))
-            if size == 1:  # a long box says its size in the next 8 bytes
-                size = int.from_bytes(file.read(8), "big") - 8
-            if size < 8 or not kind.isalnum():
-                break
-            file.seek(size - 8, 1)
-    return []
+    return FORMAT.findall(read_index(path) or b"")
 
 
 def _frame_count(path: Path) -> int:

@@ -30,6 +30,10 @@ DEINTERLACE = "idet=prog_thres=1.05:intl_thres=1.04,bwdif=mode=send_frame:deint=
 """What only says that it is interlaced stays as it is; what is gets one picture a frame.
 
 By idet's usual threshold of 1.5, slow video whose fields are of one moment is undetermined."""
+MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+"""What an MP4 begins with (ISO 14496-12, and QuickTime before it)."""
+LARGEST_INDEX = 1 << 26
+"""Bytes; that of ten hours has as many."""
 LEAST_PIXEL, MOST_PIXEL = 0.25, 4.0
 """Width of a pixel in its heights; anamorphic video has 0.75 to 2, anything beyond is damage."""
 
@@ -67,6 +71,11 @@ class VideoDecoder:
         self._log = self._stack.enter_context(DecoderLog())
         try:
             if not self._capture.isOpened() or not self._capture.grab():
+                if read_index(self.path) == b"":
+                    raise InputError(
+                        f"{self.path} has no index: it was cut off before the camera wrote one; "
+                        "copy it again, or repair it with the camera or a program such as untrunc"
+                    )
                 said = "".join(f": {complaint}" for complaint in self._log.complaints()[:1])
                 raise InputError(
                     f"{self.path} cannot be read as a video{printable(said)}; check that it plays, "
@@ -224,3 +233,25 @@ def _open_capture(path: Path, threads: int | None = None) -> Any:
         return cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG, options)
     finally:
         cv2.utils.logging.setLogLevel(loud)
+
+
+def read_index(path: Path) -> bytes | None:
+    """The box ``moov`` of an MP4 (ISO 14496-12), at most ``LARGEST_INDEX`` bytes.
+
+    Returns:
+        Nothing in it for an MP4 without one, as a camera leaves it whose power fails; None for
+        other files.
+    """
+    with path.open("rb") as file:
+        is_mp4 = file.read(8)[4:] in MP4_BOXES
+        file.seek(0)
+        while is_mp4 and len(head := file.read(8)) == 8:
+            size, kind = int.from_bytes(head[:4], "big"), head[4:]
+            if kind == b"moov":
+                return file.read(min(size, LARGEST_INDEX))
+            if size == 1:  # a long box says its size in the next 8 bytes
+                size = int.from_bytes(file.read(8), "big") - 8
+            if size < 8 or not kind.isalnum():
+                break
+            file.seek(size - 8, 1)
+    return b"" if is_mp4 else None

@@ -80,7 +80,7 @@ def test_a_video_cut_before_its_index_is_refused(
     source = tmp_path / "cut.mp4"
     write_video(source, "mp4v", small_recording)
     cut(source, 0.7)
-    refused(aquaflow("map", source, "--out", tmp_path / "out"), source)
+    refused(aquaflow("map", source, "--out", tmp_path / "out"), source, "has no index")
 
 
 def test_a_video_that_ends_early_is_mapped_as_far_as_it_goes(

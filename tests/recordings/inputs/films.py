@@ -338,7 +338,7 @@ def _cut(dive: Dive, folder: Path) -> Made:
     return made(dive, path, times_s=times_s, pictures=pictures, plain=plain)
 
 
-@row("film without its index .mp4", needs="ffmpeg", refuses="cannot be read as a video")
+@row("film without its index .mp4", needs="ffmpeg", refuses="has no index: it was cut off")
 def _no_index(dive: Dive, folder: Path) -> Made:
     path = film(folder / "a.mp4", dive.pictures, "libx264", *H264)
     path.write_bytes(path.read_bytes()[:-2000])
