@@ -133,7 +133,7 @@ def export(
 
     read = Dive(dive)
     read.require(MAP)
-    target = _given_target(out) if out else _own_target(dive / NAMES[format])
+    target = _make_parents(out) if out else _own_target(dive / NAMES[format])
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:
@@ -174,7 +174,7 @@ def report(
 
     of = Dive(dive)
     of.require(FRAMES, METRICS)
-    out = _given_target(pdf) if pdf else dive / REPORT
+    out = _make_parents(pdf) if pdf else dive / REPORT
     pages = write_pdf(out, report_of(of))
     if as_json:
         typer.echo(json.dumps({"pdf": str(out), "pages": pages}))
@@ -182,16 +182,15 @@ def report(
     typer.echo(f"Wrote {pages} pages to {out}.")
 
 
-def _given_target(path: Path) -> Path:
+def _make_parents(path: Path) -> Path:
     """``path``, with the folders above it made: a file or a folder may be wanted anywhere."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        is_file = isinstance(error, (FileExistsError, NotADirectoryError))
-        reason = f"{path.parent} is no folder" if is_file else error.strerror
-        raise InputError(
-            f"cannot write {path}: {reason}; give a folder with room that can be written to"
-        ) from error
+    from aquaflow.base.storage.atomic import explain_refusal
+
+    with explain_refusal(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise OSError(error.errno, f"{path.parent} is no folder") from error
     return path
 
 
@@ -391,7 +390,7 @@ def video(
 
     read = Dive(dive)
     read.require(MAP)
-    _given_target(out)
+    _make_parents(out)
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:

@@ -245,7 +245,7 @@ def read_index(path: Path) -> bytes | None:
     with path.open("rb") as file:
         is_mp4 = file.read(8)[4:] in MP4_BOXES
         file.seek(0)
-        while is_mp4 and len(head := file.read(8)) == 8:
+        while len(head := file.read(8)) == 8:
             size, kind = int.from_bytes(head[:4], "big"), head[4:]
             if kind == b"moov":
                 return file.read(min(size, LARGEST_INDEX))

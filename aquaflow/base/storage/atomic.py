@@ -41,7 +41,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     Raises:
         InputError: the file cannot be written.
     """
-    with _sentence(path), replacing(path) as stream:
+    with explain_refusal(path), replacing(path) as stream:
         yield stream
         stream.flush()
         os.fsync(stream.fileno())
@@ -55,7 +55,7 @@ def fresh_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: the file cannot be written.
     """
-    with _sentence(path), _part(path, path.suffix) as (name, _):
+    with explain_refusal(path), _part(path, path.suffix) as (name, _):
         part = path.with_name(name)
         yield part
         with part.open("rb") as stream:
@@ -70,7 +70,7 @@ def scratch_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: it cannot be made.
     """
-    with _sentence(path), _new_part(path, path.suffix) as (_, name, _):
+    with explain_refusal(path), _new_part(path, path.suffix) as (_, name, _):
         yield path.with_name(name)
 
 
@@ -88,7 +88,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextlib.contextmanager
-def _sentence(path: Path) -> Iterator[None]:
+def explain_refusal(path: Path) -> Iterator[None]:
+    """What the system refuses in the block is one sentence about ``path``.
+
+    Raises:
+        InputError: in place of an OSError.
+    """
     try:
         yield
     except OSError as error:

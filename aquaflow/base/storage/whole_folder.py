@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.atomic import atomic_write, make_subfolder
+from aquaflow.base.storage.atomic import atomic_write, explain_refusal, make_subfolder
 
 WORK = ".work"
 """Suffix of the hidden folder that a folder is made in."""
@@ -40,17 +40,11 @@ def whole_folder(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path} is no folder; give a folder to write to")
     remove_abandoned(path.parent, path.name)
-    with working_folder(path.parent, path.name) as work:
+    with working_folder(path.parent, path.name) as work, explain_refusal(path):
         made = work / path.name
-        try:
-            made.mkdir()
-            yield made
-            _publish(made, path)
-        except OSError as error:
-            raise InputError(
-                f"cannot write {path}: {error.strerror or error}; give a folder with room that can "
-                "be written to"
-            ) from error
+        made.mkdir()
+        yield made
+        _publish(made, path)
 
 
 def _publish(made: Path, path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import explain_refusal
 from aquaflow.base.storage.table import csv_text
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
@@ -137,7 +138,7 @@ def write_changes(out: Path, found: Changes, overwrite: bool) -> list[Path]:
     require_rasterio()
     refuse_taken(out, overwrite)
     data = found.to_json()
-    try:
+    with explain_refusal(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
         try:
@@ -154,11 +155,6 @@ def write_changes(out: Path, found: Changes, overwrite: bool) -> list[Path]:
             part.replace(out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {out}: {error.strerror or error}; give a folder with room that can be "
-            "written to"
-        ) from error
     return sorted(out.iterdir())
 
 
