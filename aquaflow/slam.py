@@ -20,6 +20,7 @@ from aquaflow.base.stages import Stages
 from aquaflow.base.worker import Worker
 from aquaflow.config import Config, MappingConfig
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.work import Growth, Insertion, MapWork, NoMaps, OwnedMaps
 from aquaflow.prior.factory import make_prior
@@ -27,7 +28,14 @@ from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.base import Base, BaseLookup, InBase
 from aquaflow.tracking.frame_table import FrameTable, RelativeFrame, RelativePoses
-from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Revisit, Step, Tracked
+from aquaflow.tracking.frames import (
+    FrameClass,
+    KeyframeEdge,
+    Revisit,
+    Step,
+    Tracked,
+    without_pictures,
+)
 from aquaflow.tracking.gate import FrameGate, GateKind, GateVerdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph, LoopsFound
 from aquaflow.tracking.initialisation.back_fill import BackFillResult
@@ -113,6 +121,10 @@ class Slam:
         """Frames that passed the gate so far."""
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
+        self._passed = -1
+        """The frame that passed the gate last."""
+        self._duplicates: dict[int, list[Tracked]] = {}
+        """By frame that passed the gate and is not finished yet, those that repeat it."""
 
     def localise_in(self, base: Base) -> None:
         """Look for this dive in an earlier one, whose frame it has once it was recognised there;
@@ -133,7 +145,7 @@ class Slam:
         frame = self._without_overlay(frame)
         verdict = self._gate(frame)
         if not verdict.passed:
-            return [self._publish(self._skip(frame, verdict))]
+            return self._skip(frame, verdict)
         step = self._track(frame)  # Eqs. 1 and 3
         return self._take(step)  # edges to the graph, frames to the maps, jobs to the worker
 
@@ -145,6 +157,7 @@ class Slam:
             self._look_for_known_lengths(linked.tracked)
             self._map(linked.tracked)
             finished.append(self._publish(linked))
+            finished += self._publish_duplicates(linked)
         for revisit in step.revisits:
             self._revisit(revisit)
         return finished
@@ -283,6 +296,7 @@ class Slam:
         if verdict.passed:
             self._map_inputs.expect(frame.index, self.used)
             self.used += 1
+            self._passed, self._duplicates[frame.index] = frame.index, []
         else:
             self.skipped[verdict.kind.value] += 1
         return verdict
@@ -348,17 +362,36 @@ class Slam:
 
     # --- poses --------------------------------------------------------------------------------
 
-    def _skip(self, frame: Frame, verdict: GateVerdict) -> RelativeFrame:
-        """A frame that the gate refused; a duplicate has the pose of the frame before it."""
-        if not verdict.same_place or self._latest is None:
-            sub_map = self.tracker.sub_map
-            return RelativeFrame(Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason))
+    def _skip(self, frame: Frame, verdict: GateVerdict) -> list[Tracked]:
+        """A frame that the gate refused; a duplicate has the pose of the frame that it repeats, and
+        waits for it."""
+        skipped = Tracked(
+            without_pictures(frame), FrameClass.SKIPPED, self.tracker.sub_map, reason=verdict.reason
+        )
+        if not verdict.same_place:
+            return [self._publish(RelativeFrame(skipped))]
+        if self._passed in self._duplicates:
+            self._duplicates[self._passed].append(skipped)
+            return []
+        if self._latest is None:
+            return [self._publish(RelativeFrame(skipped))]
         before, T_kf = self.frames[self._latest]
-        skipped = replace(
-            self._relative_poses.world_pose(before, T_kf), frame=frame,
-            frame_class=FrameClass.SKIPPED, pointmap=None, reason=verdict.reason,
+        return [self._publish(self._repeat(before, T_kf, skipped))]
+
+    def _publish_duplicates(self, of: RelativeFrame) -> list[Tracked]:
+        """Those of a frame that is finished."""
+        waited = self._duplicates.pop(of.tracked.frame.index, [])
+        return [self._publish(self._repeat(of.tracked, of.T_kf, each)) for each in waited]
+
+    def _repeat(self, before: Tracked, T_kf: Sim3 | None, skipped: Tracked) -> RelativeFrame:
+        """A duplicate with the pose of the frame ``before``, if that has one."""
+        if T_kf is None:
+            return RelativeFrame(skipped)
+        repeated = replace(
+            self._relative_poses.world_pose(before, T_kf), frame=skipped.frame,
+            frame_class=skipped.frame_class, pointmap=None, reason=skipped.reason,
         )  # fmt: skip
-        return RelativeFrame(skipped, None if skipped.T_wc is None else T_kf)
+        return RelativeFrame(repeated, None if repeated.T_wc is None else T_kf)
 
     def _follow_graph(self, at_keyframe: bool) -> None:
         """Take over what the graph's optimisation found: in step with the frames it is waited for

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +95,25 @@ def test_without_mapping_there_is_the_same_trajectory_and_no_map(
         assert a.frame_class == b.frame_class
         if a.T_wc is not None and b.T_wc is not None:
             np.testing.assert_array_equal(a.T_wc.matrix, b.T_wc.matrix)
+
+
+def test_a_repeated_picture_has_the_pose_of_the_first_also_before_there_is_a_map(
+    clip: list[Frame],
+) -> None:
+    twice = [
+        replace(frame, index=2 * i + repeat, t_ns=frame.t_ns + repeat)
+        for i, frame in enumerate(clip[:12])
+        for repeat in (0, 1)
+    ]
+    slam = ran(twice, config(enabled=False)).slam
+    results = {each.frame.index: each for each in slam.results()}
+    assert sorted(results) == list(range(24))
+    for i in range(0, 24, 2):
+        first, repeated = results[i].T_wc, results[i + 1].T_wc
+        assert results[i + 1].frame_class is FrameClass.SKIPPED
+        assert first is not None
+        assert repeated is not None
+        np.testing.assert_array_equal(first.matrix, repeated.matrix)
 
 
 # --- the order of work ----------------------------------------------------------------------------
