@@ -47,7 +47,7 @@ class BundleResult:
 
     bundle: Bundle
     residual_px: float
-    """Median reprojection error over all observations."""
+    """Median reprojection error over all observations, each times the root of its weight."""
     rho_sigma: Array
     """[P] standard deviation of the inverse depths, poses held."""
     focal_sigma: float
@@ -57,13 +57,16 @@ class BundleResult:
 def adjust(
     pixels_reference: Array,  # [P, 2] px
     pixels: Array,  # [V, P, 2] px
-    observed: npt.NDArray[np.bool_],  # [V, P]
+    weights: Array,  # [V, P]
     start: Bundle,
     solve_focal: bool = False,
     iterations: int = MAX_ITERATIONS,
 ) -> BundleResult:
-    """Least squares with Huber weights; the scale gauge is fixed at median depth 1."""
-    system = _System(pixels_reference, pixels, observed, solve_focal)
+    """Least squares of Huber's cost; the scale gauge is fixed at median depth 1.
+
+    ``weights``: information of each match, 1 for the surest, 0 where the view has none.
+    """
+    system = _System(pixels_reference, pixels, weights, solve_focal)
     rules = Rules(iterations, decrease=STOP_RELATIVE_DECREASE, shrinkage=0.2)
     return system.summary(_normalise(minimise(system, _normalise(start), rules).state))
 
@@ -122,12 +125,13 @@ class _System:
         self,
         pixels_reference: Array,  # [P, 2] px
         pixels: Array,  # [V, P, 2] px
-        observed: npt.NDArray[np.bool_],  # [V, P]
+        weights: Array,  # [V, P]
         solve_focal: bool,
     ) -> None:
         self.pixels_reference, self.pixels = pixels_reference, pixels
         # One match that is no number would cost the whole system.
-        self.observed = observed & is_measured(pixels)
+        weights = np.where(is_measured(pixels), weights, 0.0)
+        self.observed, self._root = weights > 0.0, np.sqrt(weights)
         self.solve_focal = solve_focal
         self._last: tuple[Bundle, tuple[Array, Array, Array]] | None = None
 
@@ -147,7 +151,7 @@ class _System:
 
     def cost(self, bundle: Bundle) -> float:
         error, Y, _ = self.residuals(bundle)
-        size = np.linalg.norm(error, axis=-1)
+        size = self._root * np.linalg.norm(error, axis=-1)
         # A point behind a camera that sees it costs as much as a very bad match.
         wrong = self.observed & (Y[..., 2] < 1e-3)
         return float(KERNEL.cost(size).sum() + 10.0 * HUBER_PX * wrong.sum())
@@ -156,11 +160,11 @@ class _System:
         """H_cc, H_cp, H_pp (diagonal), g_c, g_p for cameras (6 each, then log-focal) and points."""
         error, Y, rays = self.residuals(bundle)
         views, count = self.observed.shape
-        size = 6 * views + int(self.solve_focal)
-        H_cc, H_cp, H_pp = np.zeros((size, size)), np.zeros((size, count)), np.zeros(count)
-        g_c, g_p = np.zeros(size), np.zeros(count)
-        lengths = np.linalg.norm(error, axis=-1)
-        weights = KERNEL.weight(lengths) * (self.observed & (Y[..., 2] > 1e-3))
+        unknowns = 6 * views + int(self.solve_focal)
+        H_cc, H_cp = np.zeros((unknowns, unknowns)), np.zeros((unknowns, count))
+        g_c, g_p, H_pp = np.zeros(unknowns), np.zeros(count), np.zeros(count)
+        size = self._root * np.linalg.norm(error, axis=-1)
+        weights = KERNEL.weight(size) * self._root**2 * (Y[..., 2] > 1e-3)
         # View by view, for what belongs to one stays in the processor's cache.
         for v, weight in enumerate(weights):
             Jc, Jp = self._jacobians(bundle, v, Y[v], rays)
@@ -168,7 +172,7 @@ class _System:
             # A view touches its own six columns and, at the end, the focal length.
             columns = np.arange(6 * v, 6 * v + 6)
             if self.solve_focal:
-                columns = np.append(columns, size - 1)
+                columns = np.append(columns, unknowns - 1)
             wJc, wJp, k = Jc * weight, Jp * weight, len(columns)
             H_cc[np.ix_(columns, columns)] += wJc.reshape(k, -1) @ Jc.reshape(k, -1).T
             H_cp[columns] += wJc[:, 0] * Jp[0] + wJc[:, 1] * Jp[1]
@@ -227,7 +231,7 @@ class _System:
     def summary(self, bundle: Bundle) -> BundleResult:
         error, _, _ = self.residuals(bundle)
         H_cc, H_cp, H_pp, _, _ = self._blocks(bundle)
-        size = np.linalg.norm(error, axis=-1)[self.observed]
+        size = (self._root * np.linalg.norm(error, axis=-1))[self.observed]
         sigma_px = max(float(np.median(size)), 0.05) if size.size else float("inf")
         focal_sigma = 0.0
         if self.solve_focal:

@@ -136,6 +136,19 @@ def test_the_answer_has_median_inverse_depth_one_whatever_the_start_scale() -> N
     np.testing.assert_allclose(result.bundle.T[0].t, scene.T[0].t, atol=1e-6)
 
 
+def test_matches_of_little_weight_bend_the_geometry_little() -> None:
+    pixels, scene = truth()
+    seen = observations(pixels, scene)
+    unsure = np.random.default_rng(6).random(seen.shape[:2]) < 0.4
+    seen[unsure] += 0.7 * np.sign(pixels[:, 0] - CAMERA.cx)[np.nonzero(unsure)[1], None]
+    errors = []
+    for weight in (1.0, 0.02):
+        result = adjust(pixels, seen, np.where(unsure, weight, 1.0), disturbed(scene))
+        turns = [so3_log(f.R @ t.R.T) for f, t in zip(result.bundle.T, scene.T, strict=True)]
+        errors.append(float(np.max(np.abs(turns))))
+    assert errors[1] < 0.1 * errors[0]
+
+
 def test_outliers_and_missing_observations_do_little_harm() -> None:
     pixels, scene = truth()
     seen = observations(pixels, scene, 0.2)

@@ -69,6 +69,21 @@ def assert_poses(initialiser: Initialiser, poses: list[Sim3], tolerance: float) 
     assert np.linalg.norm(turns, axis=1).max() < tolerance
 
 
+def test_what_frames_with_little_parallax_match_wrongly_does_not_turn_those_with_much() -> None:
+    found = []
+    for bent_px in (0.0, 0.6):
+        initialiser = started(prior_of(MOVING))
+        for frame in initialiser.waiting[:2]:
+            frame.pixels[:, 1] += bent_px * np.sign(frame.pixels[:, 0] - CAMERA.cx)
+        solution = initialiser.solve()
+        assert solution is not None
+        found.append(solution.T)
+    for plain, bent in list(zip(*found, strict=True))[2:]:
+        assert np.linalg.norm(so3_log(plain.R @ bent.R.T)) < 1e-4
+        ways = [T.t / np.linalg.norm(T.t) for T in (plain, bent)]  # the unit is the median depth
+        assert np.linalg.norm(ways[0] - ways[1]) < 1e-3
+
+
 def test_turning_on_the_spot_never_decides_a_geometry() -> None:
     initialiser = started(prior_of(TURNING))
     assert len(initialiser.waiting) == 5
