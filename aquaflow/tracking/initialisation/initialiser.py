@@ -103,7 +103,9 @@ class Initialiser:
         parallax = rotation_compensated_parallax_px(
             self._pixels_reference[observed], pixels[observed], self.reference.camera
         )
-        confidence = np.where(observed, pair.C[rows, columns], 0.0).astype(np.float64)
+        stated = pair.C[rows, columns]
+        # One that is no number would make the whole cost none.
+        confidence = np.where(observed & (stated > 0.0), stated, 0.0).astype(np.float64)
         if (confidence > SURE).sum() >= MIN_MATCHES:
             confidence[confidence < LEAST_CONFIDENCE] = 0.0
         weights = confidence / (confidence + HALF_CONFIDENCE)

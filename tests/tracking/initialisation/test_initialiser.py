@@ -84,6 +84,19 @@ def test_what_frames_with_little_parallax_match_wrongly_does_not_turn_those_with
         assert np.linalg.norm(ways[0] - ways[1]) < 1e-3
 
 
+def test_a_confidence_that_is_no_number_costs_its_match(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior = prior_of(MOVING)
+    decode = prior.decode
+
+    def partly_nan(*arguments: object) -> KnownPair:
+        pair = decode(*arguments)
+        pair.C[:30] = math.nan
+        return pair
+
+    monkeypatch.setattr(prior, "decode", partly_nan)
+    assert_poses(started(prior), MOVING, tolerance=0.02)
+
+
 def test_turning_on_the_spot_never_decides_a_geometry() -> None:
     initialiser = started(prior_of(TURNING))
     assert len(initialiser.waiting) == 5
