@@ -368,12 +368,10 @@ class Slam:
         skipped = Tracked(
             without_pictures(frame), FrameClass.SKIPPED, self.tracker.sub_map, reason=verdict.reason
         )
-        if not verdict.same_place:
-            return [self._publish(RelativeFrame(skipped))]
-        if self._passed in self._duplicates:
+        if verdict.same_place and self._passed in self._duplicates:
             self._duplicates[self._passed].append(skipped)
             return []
-        if self._latest is None:
+        if not verdict.same_place or self._latest is None:
             return [self._publish(RelativeFrame(skipped))]
         before, T_kf = self.frames[self._latest]
         return [self._publish(self._repeat(before, T_kf, skipped))]

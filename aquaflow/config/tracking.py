@@ -32,7 +32,7 @@ class InitialisationConfig(StageConfig):
     candidates: int = Field(3, ge=1, description="E and H poses tried per pair")
     judges: int = Field(
         6, ge=2, description="waiting frames that each candidate is adjusted to; the best is then "
-        "adjusted to all",
+        "adjusted to those with most parallax",
     )  # fmt: skip
     focal_factors: tuple[float, ...] = Field(
         (0.7, 1.0, 1.4), description="starts for an unknown focal length, over the guess"

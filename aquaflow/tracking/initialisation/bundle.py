@@ -149,9 +149,16 @@ class _System:
         behind = Y[..., 2] < 1e-3
         return np.where((self.observed & ~behind)[..., None], error, 0.0), Y, rays
 
+    def _sizes(
+        self,
+        error: Array,  # [V, P, 2] px
+    ) -> Array:
+        """[V, P] px of a match of weight 1."""
+        return np.asarray(self._root * np.linalg.norm(error, axis=-1))
+
     def cost(self, bundle: Bundle) -> float:
         error, Y, _ = self.residuals(bundle)
-        size = self._root * np.linalg.norm(error, axis=-1)
+        size = self._sizes(error)
         # A point behind a camera that sees it costs as much as a very bad match.
         wrong = self.observed & (Y[..., 2] < 1e-3)
         return float(KERNEL.cost(size).sum() + 10.0 * HUBER_PX * wrong.sum())
@@ -163,7 +170,7 @@ class _System:
         unknowns = 6 * views + int(self.solve_focal)
         H_cc, H_cp = np.zeros((unknowns, unknowns)), np.zeros((unknowns, count))
         g_c, g_p, H_pp = np.zeros(unknowns), np.zeros(count), np.zeros(count)
-        size = self._root * np.linalg.norm(error, axis=-1)
+        size = self._sizes(error)
         weights = KERNEL.weight(size) * self._root**2 * (Y[..., 2] > 1e-3)
         # View by view, for what belongs to one stays in the processor's cache.
         for v, weight in enumerate(weights):
@@ -231,7 +238,7 @@ class _System:
     def summary(self, bundle: Bundle) -> BundleResult:
         error, _, _ = self.residuals(bundle)
         H_cc, H_cp, H_pp, _, _ = self._blocks(bundle)
-        size = (self._root * np.linalg.norm(error, axis=-1))[self.observed]
+        size = self._sizes(error)[self.observed]
         sigma_px = max(float(np.median(size)), 0.05) if size.size else float("inf")
         focal_sigma = 0.0
         if self.solve_focal:

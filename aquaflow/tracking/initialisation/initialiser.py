@@ -56,7 +56,7 @@ wait. Forwards in a tiled pool it is 0.27 to 0.5; reef, Curasao and IUI3, frame 
 
 SURE = 0.1
 """Confidence of a match that candidate geometries are made from, where there are enough of them."""
-LEAST_CONFIDENCE = 0.03
+UNSURE = 0.03
 """Confidence below which a match has no weight, where enough are sure: next to depth edges it
 follows what is in front, and on a periodic floor it is that of a neighbouring tile. Without this
 bound the pool of 70 pictures came in two maps instead of one."""
@@ -106,10 +106,11 @@ class Initialiser:
         stated = pair.C[rows, columns]
         # One that is no number would make the whole cost none.
         confidence = np.where(observed & (stated > 0.0), stated, 0.0).astype(np.float64)
-        if (confidence > SURE).sum() >= MIN_MATCHES:
-            confidence[confidence < LEAST_CONFIDENCE] = 0.0
+        sure = int((confidence > SURE).sum())
+        self._sure.append(sure)
+        if sure >= MIN_MATCHES:
+            confidence[confidence < UNSURE] = 0.0
         weights = confidence / (confidence + HALF_CONFIDENCE)
-        self._sure.append(int((confidence > SURE).sum()))
         # What is not a number compares with nothing: one such frame would hold up every start.
         parallax = parallax if np.isfinite(parallax) else 0.0
         farther = parallax > self.parallax_px
@@ -180,7 +181,7 @@ class Initialiser:
         hypotheses = Hypotheses(camera, pixels, self.waiting, self._config)
         result = hypotheses.best()
         explained = 0.0 if result is None else hypotheses.explained_share(result.bundle)
-        trusted = result is not None and self._trustworthy(explained, result)
+        trusted = result is not None and self._trustworthy(hypotheses, explained, result)
         little = self.parallax_px < self._enough_px
         if little:
             trusted = trusted and result is not None and self._is_decided(hypotheses, result)
@@ -196,10 +197,7 @@ class Initialiser:
             result.focal_sigma,
         )
 
-    def _trustworthy(self, explained: float, result: BundleResult) -> bool:
-        # A point that no waiting frame sees has no depth to judge by; of a wide step, most are so.
-        seen = np.any([frame.observed for frame in _wide_frames(self.waiting)], axis=0)
-        relative = result.rho_sigma[seen] / np.maximum(result.bundle.rho[seen], 1e-6)
+    def _trustworthy(self, hypotheses: Hypotheses, explained: float, result: BundleResult) -> bool:
         focal_known = (
             result.focal_sigma <= self._config.max_focal_sigma
             or self.parallax_px > 3.0 * self._config.parallax_widths * result.bundle.camera.width
@@ -207,7 +205,7 @@ class Initialiser:
         return (
             self.parallax_px > self._config.sigma_px  # less is noise, which has depths of its own
             and explained >= self._config.min_explained
-            and float(np.median(relative)) <= self._config.max_depth_sigma
+            and hypotheses.depth_sigma(result) <= self._config.max_depth_sigma
             and focal_known
         )
 
@@ -215,9 +213,7 @@ class Initialiser:
         """True if depths and direction are known, however little parallax there is: at the noise
         that matches are known to have, not that of the few that are left, and without a rival."""
         worse = max(self._config.sigma_px / result.residual_px, 1.0)
-        seen = np.any([frame.observed for frame in hypotheses.wide], axis=0)
-        relative = worse * result.rho_sigma[seen] / np.maximum(result.bundle.rho[seen], 1e-6)
-        known = float(np.median(relative)) <= self._config.max_depth_sigma
+        known = worse * hypotheses.depth_sigma(result) <= self._config.max_depth_sigma
         return known and not hypotheses.ambiguous
 
     @property
@@ -317,13 +313,14 @@ class Hypotheses:
     ) -> None:
         self._camera, self._config, self._waiting = camera, config, waiting
         self._pixels_reference = pixels_reference
-        self.wide = _wide_frames(waiting)
+        self._wide = _wide_frames(waiting)
         """The frames that the geometry is solved from; the others get their poses from it."""
         self.ambiguous = False
         """True if another direction of motion explained the frames as well as the best."""
 
     def best(self) -> BundleResult | None:
-        """The best candidate, adjusted to all frames in their order; None without candidates."""
+        """The best candidate, adjusted to the wide frames, with the poses of all frames in their
+        order; None without candidates."""
         test_frames = self._test_frames()
         few = [self._adjust(each, test_frames, FEW_STEPS) for each in self._starts(test_frames)]
         if not few:
@@ -340,9 +337,9 @@ class Hypotheses:
             ),
         )
         self.ambiguous = any(self._is_rival(each, best) for each in judged)
-        T = self._poses(best, test_frames, self.wide)
-        found = self._adjust(replace(best.bundle, T=T), self.wide)
-        T = self._poses(found, self.wide, self._waiting)
+        T = self._poses(best, test_frames, self._wide)
+        found = self._adjust(replace(best.bundle, T=T), self._wide)
+        T = self._poses(found, self._wide, self._waiting)
         return replace(found, bundle=replace(found.bundle, T=T))
 
     @staticmethod
@@ -359,6 +356,13 @@ class Hypotheses:
     def explained_share(self, bundle: Bundle) -> float:
         """Share of all information in front of its camera and within a pixel of its match."""
         return self._explained_share(bundle, self._waiting)
+
+    def depth_sigma(self, result: BundleResult) -> float:
+        """Median relative sigma of the depths that :meth:`best` found."""
+        # A point that no wide frame sees has no depth to judge by; of a wide step, most are so.
+        seen = np.any([frame.observed for frame in self._wide], axis=0)
+        relative = result.rho_sigma[seen] / np.maximum(result.bundle.rho[seen], 1e-6)
+        return float(np.median(relative))
 
     def _test_frames(self) -> list[MatchedFrame]:
         """The pairs' frames, which have most parallax, and some of the others down to the least."""
