@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,9 +24,13 @@ OVERFLOWING = ("colours = 1e+19", "colours = 3e+38")
 """Numbers, but no numbers any more when multiplied with an image gradient."""
 
 
+FASTEST, *OTHERS = native.supported_isas() or ("none",)
+ISAS = [FASTEST, *(pytest.param(isa, marks=pytest.mark.slow) for isa in OTHERS)]
+
+
 @pytest.fixture(scope="module")
-def sanitized(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The driver under sanitizers, for every instruction set that this processor runs."""
+def sanitized(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The driver under sanitizers, compiled for the instruction set that is asked for."""
     compiler = native.find_compiler()
     if compiler is None:
         pytest.skip("no C++ compiler")
@@ -33,13 +38,14 @@ def sanitized(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     probe = [*compiler, *SANITIZE, "-x", "c++", "-", "-o", str(folder / "probe")]
     if subprocess.run(probe, input=b"int main() {}", capture_output=True, check=False).returncode:
         pytest.skip(f"{compiler[0]} has no address and undefined-behaviour sanitizers")
-    drivers = {isa: folder / isa for isa in native.supported_isas()}
-    with ThreadPoolExecutor(2) as pool:
-        for built in pool.map(
-            lambda isa: compile_driver(compiler, isa, drivers[isa], SANITIZE), drivers
-        ):
-            assert built.returncode == 0, built.stderr
-    return drivers
+
+    @cache
+    def driver(isa: str) -> Path:
+        built = compile_driver(compiler, isa, folder / isa, SANITIZE)
+        assert built.returncode == 0, built.stderr
+        return folder / isa
+
+    return driver
 
 
 def with_values(name: str, value: float, seed: int) -> Scene:
@@ -133,12 +139,12 @@ def stress_tasks() -> dict[str, Task]:
     return {**tasks, **one, "many threads": Task(random_scene(29), threads=9)}
 
 
-@pytest.mark.parametrize("isa", native.supported_isas())
+@pytest.mark.parametrize("isa", ISAS)
 def test_no_sanitizer_reports_on_the_stress_scenes(
-    isa: str, sanitized: dict[str, Path], tmp_path: Path
+    isa: str, sanitized: Callable[[str], Path], tmp_path: Path
 ) -> None:
     tasks = stress_tasks()
-    results = run_driver([str(sanitized[isa])], tasks, tmp_path)
+    results = run_driver([str(sanitized(isa))], tasks, tmp_path)
     for name, result in results.items():
         if name.startswith(OVERFLOWING):
             continue
@@ -148,21 +154,21 @@ def test_no_sanitizer_reports_on_the_stress_scenes(
             assert tensor.isfinite().all(), f"{key} of '{name}'"
 
 
-@pytest.mark.parametrize("isa", native.supported_isas())
+@pytest.mark.parametrize("isa", ISAS)
 def test_no_sanitizer_reports_on_two_million_gaussians(
-    isa: str, sanitized: dict[str, Path], tmp_path: Path
+    isa: str, sanitized: Callable[[str], Path], tmp_path: Path
 ) -> None:
     scene = random_scene(30, n=2_000_000, channels=3, sigma_m=0.01)
-    result = run_driver([str(sanitized[isa])], {"two million": Task(scene)}, tmp_path)
+    result = run_driver([str(sanitized(isa))], {"two million": Task(scene)}, tmp_path)
     assert result["two million"]["visible"].sum() > 1_000_000
 
 
-@pytest.mark.parametrize("isa", native.supported_isas())
+@pytest.mark.parametrize("isa", ISAS)
 def test_every_allocation_may_fail_and_the_next_call_succeeds(
-    isa: str, sanitized: dict[str, Path], tmp_path: Path
+    isa: str, sanitized: Callable[[str], Path], tmp_path: Path
 ) -> None:
     tasks = {"usual": Task(random_scene(31, n=500)), "small": Task(random_scene(32, n=1), 1, 1)}
-    driver = [str(sanitized[isa])]
+    driver = [str(sanitized(isa))]
     plain = run_driver(driver, tasks, tmp_path)
     starved = run_driver(driver, tasks, tmp_path, "--out-of-memory")
     for name, result in plain.items():

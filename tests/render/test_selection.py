@@ -46,9 +46,11 @@ def test_asking_for_the_cpu_renderer_by_name_without_a_compiler_is_an_error() ->
         select_renderer("cpu")
 
 
-@needs_compiler
 @pytest.mark.ci
-def test_a_missing_library_is_built_where_it_belongs(tmp_path: Path) -> None:
+def test_a_missing_library_is_built_where_it_belongs(
+    tmp_path: Path, quick_compiler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CXX", quick_compiler)
     isa = native.supported_isas()[0]
     loaded = library.load_library.__wrapped__(isa, tmp_path)
     assert loaded.path == native.library_path(isa, tmp_path)

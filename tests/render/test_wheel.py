@@ -130,7 +130,7 @@ def renderer_of(wheel: Path, folder: Path) -> list[str]:
     pip("install", wheel, *options, cwd=folder, **NO_COMPILER)
     done = subprocess.run(
         [sys.executable, "-c", SHOW_RENDERER],
-        cwd=folder / "dist",
+        cwd=installed,
         env={**os.environ, **NO_COMPILER, "PYTHONPATH": str(installed)},
         capture_output=True,
         text=True,
@@ -140,16 +140,23 @@ def renderer_of(wheel: Path, folder: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_wheel_holds_every_variant_and_is_installed_without_a_compiler(tmp_path: Path) -> None:
-    compiler = native.find_compiler()
-    if compiler is None:
-        pytest.skip("no C++ compiler")
-    wheel, _ = build_wheel(tmp_path)
+@pytest.fixture(scope="module")
+def without_compiler(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The wheel that is built where there is no compiler, and the log."""
+    return build_wheel(tmp_path_factory.mktemp("without_compiler"), CXX=NO_COMPILER["CXX"])
+
+
+def test_wheel_holds_every_variant_and_is_installed_without_a_compiler(
+    quick_compiler: str, tmp_path: Path
+) -> None:
+    wheel, _ = build_wheel(tmp_path, CXX=quick_compiler)
     _, python, abi, platform = wheel.stem.rsplit("-", 3)
     assert (python, abi) == ("py3", "none")
     assert re.fullmatch(rf"manylinux_2_\d+_{os.uname().machine}", platform)
     assert platform == audited_platform(wheel)
-    assert libraries(wheel) == {f"libaquaflow_{isa}.so" for isa in native.target_isas(compiler)}
+    assert libraries(wheel) == {
+        f"libaquaflow_{isa}.so" for isa in native.target_isas([quick_compiler])
+    }
     page = ROOT / "aquaflow" / "live" / "health" / "page"
     assert page_files(wheel) == {file.name for file in page.iterdir() if file.suffix in PAGE}
     renderer, path = renderer_of(wheel, tmp_path)
@@ -167,16 +174,20 @@ def test_a_cross_built_wheel_is_tagged_with_the_target(tmp_path: Path) -> None:
     assert libraries(wheel) == {"libaquaflow_neon.so"}
 
 
-def test_without_a_compiler_the_wheel_fits_every_machine_and_torch_renders(tmp_path: Path) -> None:
-    wheel, log = build_wheel(tmp_path, CXX=NO_COMPILER["CXX"])
+def test_without_a_compiler_the_wheel_fits_every_machine_and_torch_renders(
+    without_compiler: tuple[Path, str], tmp_path: Path
+) -> None:
+    wheel, log = without_compiler
     assert wheel.name.endswith("-py3-none-any.whl")
     assert libraries(wheel) == set()
     assert "torch renderer will be used" in log
     assert renderer_of(wheel, tmp_path) == ["tiles 1"]
 
 
-def test_another_projects_drivers_on_the_path_do_not_hide_ours(tmp_path: Path) -> None:
-    wheel, _ = build_wheel(tmp_path, CXX=NO_COMPILER["CXX"])
+def test_another_projects_drivers_on_the_path_do_not_hide_ours(
+    without_compiler: tuple[Path, str], tmp_path: Path
+) -> None:
+    wheel, _ = without_compiler
     with zipfile.ZipFile(wheel) as archive:
         folders = {name.partition("/")[0] for name in archive.namelist()}
     assert folders == {"aquaflow", f"{wheel.name.partition('-py3')[0]}.dist-info"}

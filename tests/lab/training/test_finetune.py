@@ -176,7 +176,7 @@ with joined_processes() as process:
 """
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_two_processes_train_one_network(data: Path, tmp_path: Path) -> None:
     """Each sees pairs of its own, and both end with the same weights."""
     script, out = tmp_path / "worker.py", tmp_path / "out"

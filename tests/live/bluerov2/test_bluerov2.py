@@ -117,6 +117,7 @@ def test_a_power_cut_costs_no_dive(rov: BlueRov2) -> None:
     rov.until_state("idle")
 
 
+@pytest.mark.slow
 def test_a_ground_station_begins_and_ends_a_dive(rov: BlueRov2) -> None:
     rov.start()
     rov.until_state("idle")
@@ -132,6 +133,7 @@ def test_a_ground_station_begins_and_ends_a_dive(rov: BlueRov2) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_each_arming_is_a_dive(small_recording: Path, tmp_path: Path) -> None:
     with vehicle(small_recording, tmp_path, "when_armed", "when_disarmed").switched_on() as rov:
         rov.start()
