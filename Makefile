@@ -22,12 +22,15 @@ FUZZ_ARGS ?=
 FAULTS ?= 24
 SYNTHETIC := out/synthetic
 
+# Compiled modules are kept, also where the shell forbids it (containers do): without them each
+# command that a test starts compiles the product anew, and tests take twice as long.
+export PYTHONDONTWRITEBYTECODE :=
 export PIP_NO_CACHE_DIR := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
 
-.PHONY: help setup run test test-ci test-injection test-all test-kernel fuzz coverage check markers \
+.PHONY: help setup run test test-ci test-injection slow-tests test-all test-kernel fuzz coverage check markers \
   docs clean
 
 help: ## Show this list.
@@ -62,6 +65,9 @@ test-ci: setup ## Run the tests that take tens of seconds: compilers, wheels, wh
 
 test-injection: setup ## Let FAULTS=24 calls into libraries fail, one in each small dive.
 	$(BIN)/python -m tests.injection --sample $(FAULTS) --seed 16
+
+slow-tests: setup # Left to 'make test-all': their names.
+	$(BIN)/pytest -m slow --collect-only -q
 
 test-all: setup ## Run all tests, also those on whole recordings.
 	$(BIN)/pytest
