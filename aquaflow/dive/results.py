@@ -15,6 +15,7 @@ from aquaflow.render.image_metrics import lpips_network
 from aquaflow.render.transfer_counts import transfers
 from aquaflow.slam import Slam
 from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped
 
@@ -98,6 +99,7 @@ def metrics(
         "mapping_frames": classes.count(FrameClass.MAPPING),
         "common_frames": classes.count(FrameClass.COMMON),
     }
+    drift = scale_drift(slam.graph.snapshot, slam.keyframes.keyframes)
     perceptual = [example.lpips for example in held_out if example.lpips is not None]
     as_tracked = [example.as_tracked for example in held_out if example.as_tracked is not None]
     return counts | {
@@ -107,6 +109,7 @@ def metrics(
         "loops": slam.graph.loops,
         "adjustments": slam.adjuster.tally.to_json(),
         "consistency": slam.tracker.monitor.counts.to_json(),
+        "scale_drift": None if drift is None else drift.to_json(),
         "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
         "steps": sum(mapper.steps for mapper in slam.mappers.values()),
         "steps_undone": sum(mapper.undone for mapper in slam.mappers.values()),

@@ -39,6 +39,7 @@ from aquaflow.slam import FinishTime, Slam
 from aquaflow.sources.picture_check import PictureCheck
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error
+from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
@@ -292,6 +293,8 @@ class DiveRun:
                 "was full"
             )
         self.notes += self.slam.tracker.monitor.counts.notes()
+        drift = scale_drift(self.slam.graph.snapshot, self.slam.keyframes.keyframes)
+        self.notes += [] if drift is None else drift.notes()
         if self.slam.in_base is not None:
             self.notes += in_site_notes(self.slam.in_base, self.slam.keyframes)
         for note in self.notes:

@@ -11,6 +11,7 @@ errors are no common scale are seen by the matches that no pose explains.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -24,6 +25,7 @@ from aquaflow.geometry.two_view import pose_candidates
 from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.optimise.robust import sigma_of
 from aquaflow.prior.contract import PairGeometry
+from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.tracking.loops import Neighbour, Neighbours, sketch
 from aquaflow.tracking.pose.matcher import Matched
 
@@ -317,3 +319,53 @@ def rigid_share(
     pixels = pair.matches[rows, columns].astype(np.float64)
     candidates = pose_candidates(pixels_k, pixels, camera_k, camera)
     return candidates[0].support if candidates else 0.0
+
+
+# --------------------------------------------------------------------------------------------------
+# Scale that drifts slowly takes all keyframes around with it, so that nothing above sees it. Loops
+# and telemetry do: what they changed of the links' scales is the drift.
+
+TOLD_DRIFT = 0.03
+"""Relative, from which a drift is told to the user."""
+
+
+@dataclass(frozen=True)
+class ScaleDrift:
+    """The largest drift of scale along the links of a graph, as its optimisation corrected it."""
+
+    first: int
+    """Frame between whose keyframe and that of ``last`` it grew."""
+    last: int
+    ratio: float
+    """Of the scale as tracked to the corrected one, at ``last``, over the same at ``first``."""
+
+    def notes(self) -> list[str]:
+        """A sentence for the user if the drift is worth one."""
+        if abs(np.log(self.ratio)) < TOLD_DRIFT:
+            return []
+        return [
+            f"the scale of tracking drifted by {100.0 * (self.ratio - 1.0):+.0f} % between frames "
+            f"{self.first} and {self.last}; loops or telemetry showed it, and it was corrected"
+        ]
+
+    def to_json(self) -> dict[str, float | int]:
+        """The drift as metrics.json has it."""
+        return {"first": self.first, "last": self.last, "ratio": round(self.ratio, 4)}
+
+
+def scale_drift(graph: Snapshot, keyframes: Sequence[Keyframe]) -> ScaleDrift | None:
+    """From the units that loops and telemetry gave the keyframes along each chain of links: as it
+    was tracked, a keyframe has the unit of the one before. None without links."""
+    links = graph.edges[~graph.edges["loop"]]
+    if not len(links):
+        return None
+    drift, root = -np.log(graph.nodes["scale"]), np.arange(len(graph.nodes))
+    for a, b in zip(links["a"].tolist(), links["b"].tolist(), strict=True):
+        root[max(a, b)] = root[min(a, b)]
+    largest = max(
+        (np.flatnonzero(root == each) for each in np.unique(root)),
+        key=lambda rows: float(np.ptp(drift[rows])),
+    )
+    ends = sorted((largest[np.argmin(drift[largest])], largest[np.argmax(drift[largest])]))
+    first, last = (keyframes[graph.nodes["number"][row]].frame_index for row in ends)
+    return ScaleDrift(first, last, float(np.exp(drift[ends[1]] - drift[ends[0]])))

@@ -32,6 +32,8 @@ DIRECTION_TIME_S = 60.0
 """s, correlation time of the errors of attitude filters and compasses."""
 HELD = 1e-3
 """m and rad, 1 sigma of what is a convention: where the world's origin and its x axis are."""
+LEAST_FOR_TREND = 8
+"""Keyframes with a measured scale below which a trend is not looked for."""
 LARGEST_SCALE_SIGMA = 0.2
 """Relative; what says less of the scale is left out: a vehicle that hovers."""
 
@@ -206,6 +208,8 @@ class WorldEdge:
     """Squared difference to the present pose, in sigmas."""
     count: int
     """Numbers that were measured."""
+    scale_apart: tuple[float, float] | None = None
+    """Logarithm of the measured over the present scale, and 1 sigma; None where not measured."""
 
 
 def world_edge(
@@ -231,14 +235,17 @@ def world_edge(
         known = np.isfinite(sigmas)
         R = so3_exp(np.where(known, measured.turn, 0.0)) @ R
         rows += [_turns(axis, T_nk) / sigmas[axis] for axis in range(3) if known[axis]]
+    scale_apart = None
     if measured.scale is not None:
         scale, sigma = measured.scale
+        scale_apart = float(np.log(scale / T_nk.scale)), sigma
         rows.append(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0 / sigma]))
     if not rows:
         return None
     A, T_measured = np.stack(rows), Sim3(R, t, scale)
     apart = A @ (T_measured.inverse() @ T_nk).log()
-    return WorldEdge(keyframe, T_measured, A.T @ A, float(apart @ apart), len(rows))
+    chi2 = float(apart @ apart)
+    return WorldEdge(keyframe, T_measured, A.T @ A, chi2, len(rows), scale_apart)
 
 
 def _moves(axis: int, T_nk: Sim3) -> Array:
@@ -270,6 +277,22 @@ class World:
     def strain(self) -> float:
         """Mean of the squared differences, in sigmas: 1 where path and telemetry agree."""
         return sum(e.chi2 for e in self.edges) / max(sum(e.count for e in self.edges), 1)
+
+    @property
+    def scale_trend_sigmas(self) -> float:
+        """Slope of measured over present scale from keyframe to keyframe, in its own sigmas; 0 with
+        too few measurements to say. It shows a slow drift that no single keyframe shows."""
+        known = [(e.keyframe, *e.scale_apart) for e in self.edges if e.scale_apart is not None]
+        if len(known) < LEAST_FOR_TREND:
+            return 0.0
+        number, apart, sigma = np.array(known).T
+        weight = sigma**-2.0
+        place = number - np.average(number, weights=weight)
+        apart = apart - np.average(apart, weights=weight)
+        information = float((weight * place**2).sum())
+        slope = float((weight * place * apart).sum()) / max(information, 1e-12)
+        spread = float((weight * (apart - slope * place) ** 2).sum()) / (len(known) - 2)
+        return abs(slope) * float(np.sqrt(information / max(spread, 1.0)))
 
     @staticmethod
     def at(component: int, frame: WorldFrame, edges: Sequence[WorldEdge]) -> World:

@@ -63,6 +63,9 @@ def estimates_of(survey: TrackingSnapshot) -> dict[int, Estimate]:
 STRAIN = 1.5
 """Mean squared difference of path and telemetry, in sigmas, up to which a sub-map stays as it is:
 the camera alone is more precise than any instrument where nothing has drifted."""
+TREND_SIGMAS = 4.0
+"""Of the slope of the measured scale along the dive, from which a sub-map is straightened though
+single keyframes agree: 0.1 % a second for 90 s with a DVL has a strain of 0.4 to 0.8."""
 LINK_TURN = np.radians(0.05)
 """rad, 1 sigma: links of a synthetic forward view of 164 keyframes turn by 0.02 to 0.08 degrees too
 much, root mean square, and mostly the same way; the pose solver's own sigma is 0.01."""
@@ -100,7 +103,7 @@ def straighten(
         moments = np.array([t_s[number] for number in numbers.tolist()])
         edges = world_edges(found, numbers, moments, poses_of(inside))
         world = World.at(component, found.frame, edges)
-        if world.strain > STRAIN:
+        if world.strain > STRAIN or world.scale_trend_sigmas > TREND_SIGMAS:
             worlds.append(world)
     result, T_mn = solve_with_worlds(snapshot, worlds)
     frames = {component: found.frame for component, found in estimates.items()}

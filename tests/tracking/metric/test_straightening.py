@@ -7,11 +7,13 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
+from aquaflow.keyframes import Keyframe, KeyframeStore
+from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 from aquaflow.tracking.graph.table import GraphResult
 from aquaflow.tracking.metric.measured import KeyframeMeasurements, World, WorldEdge, world_edge
-from aquaflow.tracking.metric.straightening import solve_with_worlds
+from aquaflow.tracking.metric.straightening import STRAIN, TREND_SIGMAS, solve_with_worlds
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, Dive
 
 Array = npt.NDArray[np.float64]
@@ -87,6 +89,67 @@ def test_scale_drift_of_five_percent_is_pulled_straight(kind: str, left: float) 
     # What counts is drift: the unit of the whole is the world's to say.
     assert np.ptp(after) < left * DRIFT
     np.testing.assert_allclose(poses.scale / poses.scale[0], 1.0, atol=left * DRIFT)
+
+
+def keyframe_of(number: int, frame: int) -> Keyframe:
+    return Keyframe(number, frame, 0, Sim3.identity(), 0, KeyframeStore())
+
+
+def test_a_drift_that_telemetry_showed_is_told_with_its_frames() -> None:
+    truth, graph, edges = way(), PoseGraph(), list[WorldEdge]()
+    grown = np.exp(np.linspace(0.0, np.log1p(DRIFT), COUNT))
+    for k in range(COUNT):
+        if k == 0:
+            graph.add_keyframe(0, truth.element(0))
+        else:  # the depths that it was tracked by are too large, and so is the step
+            step = truth.element(k - 1).inverse() @ truth.element(k)
+            link = Sim3(step.R, grown[k - 1] * step.t)
+            graph.add_keyframe(k, graph.pose(k - 1) @ link)
+            assert graph.add_edge(Edge(k - 1, k, link, LINK))
+        measured = KeyframeMeasurements(
+            scale=(1.0 / grown[k], 0.025), place_m=(truth.t[k, :2], 1e-3) if k == 0 else None
+        )
+        edge = world_edge(k, graph.pose(k), measured)
+        assert edge is not None
+        edges.append(edge)
+    keyframes = [keyframe_of(k, 10 * k) for k in range(COUNT)]
+    unseen = scale_drift(graph.snapshot(), keyframes)
+    assert unseen is not None
+    assert unseen.ratio == 1.0
+    assert unseen.notes() == []
+    telemetry = World(0, Sim3.identity(), edges)
+    assert telemetry.strain < STRAIN
+    assert telemetry.scale_trend_sigmas > TREND_SIGMAS
+    solved(graph, [telemetry])
+    found = scale_drift(graph.snapshot(), keyframes)
+    assert found is not None
+    assert 0.6 * DRIFT < found.ratio - 1.0 < 1.2 * DRIFT
+    assert found.first < 10 * (COUNT // 4) < 10 * (3 * COUNT // 4) < found.last
+    [note] = found.notes()
+    assert f"between frames {found.first} and {found.last}" in note
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_the_measured_scale_is_no_trend(seed: int) -> None:
+    noise = 0.03 * np.random.default_rng(seed).standard_normal(COUNT)
+    measured = [KeyframeMeasurements(scale=(float(np.exp(each)), 0.03)) for each in noise]
+    edges = [world_edge(k, Sim3.identity(), each) for k, each in enumerate(measured)]
+    assert World(0, Sim3.identity(), [e for e in edges if e]).scale_trend_sigmas < TREND_SIGMAS
+
+
+def test_the_place_of_a_joined_sub_map_is_no_drift() -> None:
+    graph = PoseGraph()
+    keyframes = []
+    for k in range(6):
+        scale = 1.0 if k < 3 else 2.0
+        graph.add_keyframe(k, Sim3(np.eye(3), np.array([0.5 * k, 0.0, 0.0]), scale))
+        keyframes.append(keyframe_of(k, k))
+        if k % 3:
+            link = graph.pose(k).inverse() @ graph.pose(k - 1)
+            assert graph.add_edge(Edge(k, k - 1, link, LINK))
+    found = scale_drift(graph.snapshot(), keyframes)
+    assert found is not None
+    assert found.ratio == pytest.approx(1.0)
 
 
 def test_without_a_world_nothing_of_the_graph_changes() -> None:
