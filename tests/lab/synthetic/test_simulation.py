@@ -160,8 +160,15 @@ def test_a_vehicle_at_a_wall_cannot_be_asked_to_turn() -> None:
         SyntheticConfig.model_validate({"scene": "wall", "turns": True})
 
 
-@pytest.mark.parametrize("seconds", [60, 120])
-@pytest.mark.parametrize("scene", ["reef", "flat_sand", "pipe", "wall", "survey"])
+SCENES = ("reef", "flat_sand", "pipe", "wall", "survey")
+MINUTES = [
+    *[(scene, 60) for scene in SCENES],
+    ("reef", 120),
+    *[pytest.param(scene, 120, marks=pytest.mark.slow) for scene in SCENES[1:]],
+]
+
+
+@pytest.mark.parametrize(("scene", "seconds"), MINUTES)
 def test_dives_of_a_minute_or_two_span_a_metre_of_depth(scene: str, seconds: int) -> None:
     frames = 4 * seconds
     way = motion(scene=scene, frames=frames, fps=4.0, altitude_m=2.0, altitude_swing_m=0.7)
