@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
 SQUARE_PX = 60
-RAYS = 3
+RAYS = 2
 """Along each side of a pixel."""
 KNOT_PX = 8
 

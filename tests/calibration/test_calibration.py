@@ -12,7 +12,7 @@ import pytest
 
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.calibration.board import LEAST_VIEWS, Board, BoardKind, Detector, draw, write_board
-from aquaflow.calibration.calibrate import calibrate, write_calibration
+from aquaflow.calibration.calibrate import Calibration, calibrate, write_calibration
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.port import FlatPort
 from tests.calibration.board_pictures import Image, pictures, taken
@@ -36,6 +36,11 @@ def through_glass(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written(tmp_path_factory.mktemp("port") / "pictures", made)
 
 
+@pytest.fixture(scope="module")
+def lens_behind_glass(through_glass: Path) -> Calibration:
+    return calibrate(through_glass, BOARD, "radtan", known=BEHIND_GLASS)
+
+
 @pytest.mark.parametrize(
     ("camera", "kind", "range_m"),
     [(RADTAN, "charuco", 0.55), (RADTAN, "apriltag", 0.55), (FISHEYE, "charuco", 0.4)],
@@ -55,8 +60,8 @@ def test_the_lens_that_took_the_pictures_comes_back_within_its_sigma(
     assert fit.rms_px < 0.25
 
 
-def test_the_lens_behind_a_known_port_comes_back(through_glass: Path) -> None:
-    fit = calibrate(through_glass, BOARD, "radtan", known=BEHIND_GLASS).fit
+def test_the_lens_behind_a_known_port_comes_back(lens_behind_glass: Calibration) -> None:
+    fit = lens_behind_glass.fit
     assert fit.camera.port == BEHIND_GLASS.port
     assert fit.camera.fx == pytest.approx(520.0, rel=3e-3)
     assert abs(fit.camera.fx - 520.0) < 3.0 * fit.sigma[0]
@@ -71,9 +76,9 @@ def test_the_place_of_a_port_comes_back_where_the_lens_is_known(through_glass: P
 
 
 def test_a_result_is_a_camera_file_figures_and_a_picture(
-    tmp_path: Path, through_glass: Path
+    tmp_path: Path, lens_behind_glass: Calibration
 ) -> None:
-    found = calibrate(through_glass, BOARD, "radtan", known=BEHIND_GLASS)
+    found = lens_behind_glass
     camera, figures, plot, ros, opencv = write_calibration(found, tmp_path / "new" / "folder")
     assert load_camera(camera) == found.fit.camera
     assert ros.name == "camera_ros.yaml"

@@ -53,7 +53,7 @@ def test_a_wrong_focal_length_or_distortion_is_found_and_measured(
     assert error.noise_fitted < error.noise_given
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01), st.integers(0, 1000), st.floats(0.05, 0.15))
 def test_an_error_that_good_calibrations_have_is_never_a_warning(
     focal: float, radial: float, seed: int, turning: float

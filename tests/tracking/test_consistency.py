@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -74,9 +75,19 @@ def steps(fault: Fault, enabled: bool = True) -> tuple[Tracker, list[Step]]:
     return tracker, [*made, tracker.finish()]
 
 
+@cache
+def swum(fault: Fault, enabled: bool = True) -> tuple[Tracker, list[Step]]:
+    """Of a tracker that no test has changed; only read."""
+    return steps(fault, enabled)
+
+
+def frames_of(made: list[Step]) -> list[Tracked]:
+    return [tracked for step in made for tracked in step.frames]
+
+
 def swim(fault: Fault, enabled: bool = True) -> tuple[Tracker, list[Tracked]]:
-    tracker, made = steps(fault, enabled)
-    return tracker, [tracked for step in made for tracked in step.frames]
+    tracker, made = swum(fault, enabled)
+    return tracker, frames_of(made)
 
 
 def late_error(tracked: list[Tracked]) -> float:
@@ -116,7 +127,8 @@ def test_depths_that_no_scale_corrects_are_triangulated_anew(
     """Where the keyframe is not left before, as the test below says that it is."""
     monkeypatch.setattr(current_keyframe, "SCARCE", 0.0)
     monkeypatch.setattr(WideSteps, "is_contradicted", lambda *_: False)
-    tracker, tracked = swim(bend)
+    tracker, made = steps(bend)
+    tracked = frames_of(made)
     counts = tracker.monitor.counts
     assert [finding.cause for finding in counts.findings][:1] == [Cause.MATCHES]
     assert counts.findings[0].frame < NOTICED
@@ -155,8 +167,8 @@ def test_a_finding_is_shown_for_some_seconds() -> None:
 
 
 def test_a_keyframe_whose_scale_is_wrong_is_returned_to_no_more() -> None:
-    tracker, made = steps(scale)
-    tracked = [tracked for step in made for tracked in step.frames]
+    tracker, made = swum(scale)
+    tracked = frames_of(made)
     revisits = [revisit for step in made for revisit in step.revisits]
     found = tracker.monitor.counts.findings[0]
     assert found.keyframe not in {t.keyframe for t in tracked if t.frame.index > found.frame}

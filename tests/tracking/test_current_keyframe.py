@@ -116,9 +116,9 @@ def wander(count: int) -> list[Sim3]:
 
 
 def test_a_place_that_has_keyframes_enough_gets_no_more() -> None:
-    poses = wander(250)
     made = {}
-    for crowd in (3, 1000):
+    for crowd, count in ((3, 250), (1000, 190)):
+        poses = wander(count)
         prior = told(poses)
         config = QUICK.model_copy(update={"crowd": crowd})
         result = run(prior.frames(SMALL), config, prior)
@@ -130,7 +130,7 @@ def test_a_place_that_has_keyframes_enough_gets_no_more() -> None:
 
 
 def test_a_crowded_place_is_not_searched_anew_at_every_frame() -> None:
-    poses, looks = wander(120), {}
+    poses, looks = wander(80), {}
     for look_s in (0.0, 1.0):
         prior = told(poses)
         result = run(prior.frames(SMALL), QUICK.model_copy(update={"crowd_look_s": look_s}), prior)

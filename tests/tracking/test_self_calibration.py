@@ -43,7 +43,7 @@ def test_focal_length_and_distortion_are_found_from_a_guess_far_off(
 
 def test_the_stated_sigma_is_the_spread() -> None:
     errors = []
-    for seed in range(12):
+    for seed in range(6):
         found = estimate(*swim((0.05, 0.05), turning=0.03, views=8, seed=seed, reach=4))
         errors.append((found.lens[:2] - 0.05) / found.sigma)
 

@@ -11,7 +11,7 @@ from tests.water.simulated_dives import Kind, dive
 from tests.water.water_observations import fitted, sighted
 
 
-@pytest.mark.parametrize("span", [1.5, 3.0])
+@pytest.mark.parametrize("span", [1.5, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_water_is_found_and_clear_water_is_called_clear(span: float) -> None:
     for water in (True, False):
         found = row(Kind(span, 0.02, 0.2, water), dives=2)

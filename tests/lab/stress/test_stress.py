@@ -146,7 +146,7 @@ def test_without_its_guard_the_case_fails(
 
 def test_a_pose_that_too_little_supports_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chance matches after a jump; no picture supports a pose by more than all of its pixels."""
-    frames = swim.film(swim.Floor(0), swim.path(12))
+    frames = swim.film(swim.Floor(0), swim.path(8))
     posed = len(swim.track(frames).posed)
     monkeypatch.setattr(swim, "TrackingConfig", lambda: TrackingConfig(min_support=0.999))
     assert len(swim.track(frames).posed) < posed == len(frames)

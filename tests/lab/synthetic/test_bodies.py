@@ -12,7 +12,7 @@ import torch
 
 from aquaflow.lab.synthetic import SyntheticConfig, Truth, objects, read_truth, write_dive
 
-BARE = {"supersampling": 1, "snow_per_m3": 0.0, "noise_sigma": 0.0, "width": 96, "height": 72}
+BARE = {"supersampling": 1, "snow_per_m3": 0.0, "noise_sigma": 0.0, "width": 64, "height": 48}
 
 
 def written(out: Path, **asked: object) -> Truth:

@@ -19,18 +19,26 @@ from aquaflow.lab.synthetic import (
     simulate,
     write_dive,
 )
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
+from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.types import Altitude, AngularRate, Attitude, Depth, Velocity
 from tests.lab.synthetic.without_errors import WITHOUT_ERRORS
 
 Array = npt.NDArray[np.float64]
 Kind = TypeVar("Kind")
+RATES = [name for name in TelemetryNoise.model_fields if name.endswith("_hz")]
 
 
 def dive(telemetry: dict[str, float] | None = None, **settings: object) -> SimulatedDive:
     """A dive with perfect instruments, but for ``telemetry``."""
     noise = {**WITHOUT_ERRORS, **(telemetry or {})}
     return simulate(SyntheticConfig.model_validate({"telemetry": noise, **settings}))
+
+
+def motion(**settings: object) -> TrueBodyMotion:
+    """Of a dive whose instruments are all silent: their samples are most of the work."""
+    return dive(dict.fromkeys(RATES, 0.0), **settings).motion
 
 
 def heard(simulated: SimulatedDive, kind: type[Kind]) -> tuple[Array, list[Kind]]:
@@ -135,16 +143,15 @@ def test_instruments_that_are_not_aboard_are_silent() -> None:
 
 
 def test_a_vehicle_that_turns_points_along_its_way() -> None:
-    held, turning = dive(frames=600), dive(frames=600, turns=True)
-    for simulated, least, most in ((held, -0.5, 0.5), (turning, 0.75, 1.0)):
-        velocity = simulated.motion.velocity_b(simulated.times_s)
+    t = 0.1 * np.arange(600)
+    held, turning = motion(frames=600), motion(frames=600, turns=True)
+    for of_dive, least, most in ((held, -0.5, 0.5), (turning, 0.75, 1.0)):
+        velocity = of_dive.velocity_b(t)
         ahead = np.median(velocity[:, 0] / np.linalg.norm(velocity, axis=1))
         assert least < ahead <= most
-    rate = np.degrees(turning.motion.rate_b(turning.times_s))[:, 2]
+    rate = np.degrees(turning.rate_b(t))[:, 2]
     assert 20.0 < np.abs(rate).max() < 40.0
-    heading = np.unwrap(
-        Rotation.from_matrix(turning.motion.R_wb(turning.times_s)).as_euler("ZYX")[:, 0]
-    )
+    heading = np.unwrap(Rotation.from_matrix(turning.R_wb(t)).as_euler("ZYX")[:, 0])
     assert np.ptp(heading) > np.pi
 
 
@@ -153,14 +160,21 @@ def test_a_vehicle_at_a_wall_cannot_be_asked_to_turn() -> None:
         SyntheticConfig.model_validate({"scene": "wall", "turns": True})
 
 
-@pytest.mark.parametrize("seconds", [60, 120])
-@pytest.mark.parametrize("scene", ["reef", "flat_sand", "pipe", "wall", "survey"])
+SCENES = ("reef", "flat_sand", "pipe", "wall", "survey")
+MINUTES = [
+    *[(scene, 60) for scene in SCENES],
+    ("reef", 120),
+    *[pytest.param(scene, 120, marks=pytest.mark.slow) for scene in SCENES[1:]],
+]
+
+
+@pytest.mark.parametrize(("scene", "seconds"), MINUTES)
 def test_dives_of_a_minute_or_two_span_a_metre_of_depth(scene: str, seconds: int) -> None:
     frames = 4 * seconds
-    motion = dive(scene=scene, frames=frames, fps=4.0, altitude_m=2.0, altitude_swing_m=0.7).motion
+    way = motion(scene=scene, frames=frames, fps=4.0, altitude_m=2.0, altitude_swing_m=0.7)
     t = np.linspace(0.0, seconds - 1.0, 200)
-    assert np.ptp(motion.origin_w(t)[:, 2]) > 1.0
-    assert np.abs(motion.velocity_w(t)[:, 2]).max() < 1.0
+    assert np.ptp(way.origin_w(t)[:, 2]) > 1.0
+    assert np.abs(way.velocity_w(t)[:, 2]).max() < 1.0
 
 
 @pytest.mark.parametrize("scene", ["reef", "wall"])

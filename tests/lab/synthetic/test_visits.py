@@ -13,7 +13,7 @@ from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.lab.synthetic.dive import build, write_dive
 from aquaflow.lab.synthetic.site import SurveySite, site_of
 
-SITE = {"frames": 12, "width": 96, "height": 72, "fps": 6.0, "margin_m": 1.0}
+SITE = {"frames": 12, "width": 48, "height": 36, "fps": 6.0, "margin_m": 1.0}
 VISIT = {"over": SITE, "offset_m": (0.2, -0.1), "heading_deg": 30.0}
 BOX = {"kind": "box", "at_m": (1.5, 0.2), "half_m": 0.1}
 

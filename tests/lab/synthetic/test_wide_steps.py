@@ -44,7 +44,7 @@ def test_a_survey_looks_down_and_shares_two_thirds_with_the_next_picture(tmp_pat
 
 
 def test_a_pool_is_seen_forward_in_wide_steps_and_all_round(tmp_path: Path) -> None:
-    truth = written(tmp_path, scene="pool", frames=60)
+    truth = written(tmp_path, scene="pool", frames=60, width=32, height=24)
     steps = np.linalg.norm(np.diff(truth.T_wc[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.25, atol=0.03)
     assert 4.0 < np.median(turns_deg(truth)) < 8.0

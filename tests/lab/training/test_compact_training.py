@@ -86,6 +86,14 @@ def recorded(folder: Path) -> Recorded:
     return Recorded(**vars(task(folder)))
 
 
+@pytest.fixture(scope="module")
+def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Recorded, Path]:
+    """A run that nothing stopped, and its folder; only read."""
+    ended, out = recorded(folder), tmp_path_factory.mktemp("whole")
+    train(ended, PLAN, out, silent)
+    return ended, out
+
+
 def test_one_pair_is_learnt_by_heart(pair: Pair) -> None:
     prior = network()
     optimiser = torch.optim.AdamW(prior.parameters(), lr=4e-3)
@@ -153,9 +161,11 @@ def test_early_steps_use_the_first_scenes_only(folder: Path) -> None:
     assert int(torch.stack(asked).max()) < SETTINGS.scenes
 
 
-def test_a_run_that_was_stopped_ends_with_the_same_weights(folder: Path, tmp_path: Path) -> None:
-    whole, parts = recorded(folder), recorded(folder)
-    history = train(whole, PLAN, tmp_path / "whole", silent)
+def test_a_run_that_was_stopped_ends_with_the_same_weights(
+    whole: tuple[Recorded, Path], folder: Path, tmp_path: Path
+) -> None:
+    ended, parts = whole[0], recorded(folder)
+    history = json.loads((whole[1] / HISTORY).read_text())
 
     def stops(stage: str, done: int, total: int) -> None:
         if done == 3:  # after the checkpoint of step 2
@@ -166,17 +176,15 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights(folder: Path, tmp_pat
     resumed = recorded(folder)
     again = train(resumed, PLAN, tmp_path / "parts", silent)
     for one, other in zip(
-        whole.network.state_dict().values(), resumed.network.state_dict().values(), strict=True
+        ended.network.state_dict().values(), resumed.network.state_dict().values(), strict=True
     ):
         assert torch.equal(one, other)
     assert [row["loss_coarse"] for row in again] == [row["loss_coarse"] for row in history]
 
 
 def test_hours_stop_a_run_that_then_goes_on_to_the_same_weights(
-    folder: Path, tmp_path: Path
+    whole: tuple[Recorded, Path], folder: Path, tmp_path: Path
 ) -> None:
-    whole = recorded(folder)
-    train(whole, PLAN, tmp_path / "whole", silent)
     calls = 0
     while True:
         part = recorded(folder)
@@ -186,7 +194,7 @@ def test_hours_stop_a_run_that_then_goes_on_to_the_same_weights(
             break
     assert calls == PLAN.schedule.steps
     for one, other in zip(
-        whole.network.state_dict().values(), part.network.state_dict().values(), strict=True
+        whole[0].network.state_dict().values(), part.network.state_dict().values(), strict=True
     ):
         assert torch.equal(one, other)
 
@@ -259,12 +267,11 @@ def test_ranges_are_learnt_from_maps_and_not_from_pictures(
     assert seen[0].tolist() == [True, True, True, False]
 
 
-def test_a_run_leaves_a_curve_and_its_figures(folder: Path, tmp_path: Path) -> None:
-    train(recorded(folder), PLAN, tmp_path, silent)
-    rows = json.loads((tmp_path / HISTORY).read_text())
+def test_a_run_leaves_a_curve_and_its_figures(whole: tuple[Recorded, Path]) -> None:
+    rows = json.loads((whole[1] / HISTORY).read_text())
     assert [row["step"] for row in rows] == [2.0, 4.0]
     assert rows[-1]["figure"] == 0.5
-    assert (tmp_path / CURVE).read_bytes().startswith(b"\x89PNG")
+    assert (whole[1] / CURVE).read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_checkpoint_of_another_network_is_refused(folder: Path, tmp_path: Path) -> None:

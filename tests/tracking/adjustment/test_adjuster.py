@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,6 +16,7 @@ from aquaflow.config.tracking import AdjustmentConfig, GraphConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
@@ -30,10 +31,27 @@ LENGTH_ERROR = 0.03
 """Relative, of every link, in turn too long and too short: what an adjustment has to find."""
 
 
+PATH, PRIOR = lawn_path(COUNT, STEP_M), ClassicalPrior()
+
+
 @cache
-def pictures() -> list[np.ndarray]:
-    floor = SeaFloor()
-    return [floor.picture(T) for T in lawn_path(COUNT, STEP_M)]
+def floor() -> SeaFloor:
+    return SeaFloor()
+
+
+@cache
+def depth(place: int) -> Array:
+    return floor().depth(PATH[place])
+
+
+@cache
+def seen(place: int) -> FlowEncoding:
+    return PRIOR.encode(floor().picture(PATH[place]), CAMERA)
+
+
+@cache
+def matched(place: int, other: int) -> FlowPair:
+    return PRIOR.decode(seen(place), seen(other))
 
 
 @dataclass
@@ -45,23 +63,25 @@ class Swim:
     store: KeyframeStore
     failures: Failures
     wait: bool = True
+    places: Sequence[int] = range(COUNT)
+    """Of PATH, where the keyframes are."""
 
-    def __post_init__(self) -> None:
-        self.truth = lawn_path(COUNT, STEP_M)
-        self.prior, self.floor = ClassicalPrior(), SeaFloor()
+    @property
+    def truth(self) -> list[Sim3]:
+        return [PATH[place] for place in self.places]
 
     def add(self, number: int) -> None:
-        """The keyframe ``number`` of the path."""
+        """The keyframe ``number`` of the dive."""
         T_wc = self.truth[0] if number == 0 else self.store[number - 1].T_wc
-        rho = 1.0 / self.floor.depth(self.truth[number])
+        place = self.places[number]
+        rho = 1.0 / depth(place)
         pointmap = Pointmap(CAMERA, rho, (0.02 * rho) ** 2)
-        encoding = self.prior.encode(pictures()[number], CAMERA)
-        self.store.add(number, number, encoding, T_wc, pointmap, 0)
+        self.store.add(number, number, seen(place), T_wc, pointmap, 0)
         link = None
         if number > 0:
             T = self.truth[number].inverse() @ self.truth[number - 1]
             T_fk = Sim3(T.R, (1.0 + LENGTH_ERROR * (-1) ** number) * T.t)
-            pair = self.prior.decode(self.store[number - 1].encoding, encoding)
+            pair = matched(self.places[number - 1], place)
             link = KeyframeEdge(number - 1, T_fk, np.diag([0.02] * 3 + [0.002] * 3) ** 2, pair)
         if self.wait:
             self.graph.correction(wait=True)
@@ -220,22 +240,19 @@ def test_the_window_is_as_long_as_the_config_says(swim: Callable[..., Swim]) -> 
 # --- loops ----------------------------------------------------------------------------------------
 
 
-def out_and_back() -> list[int]:
-    """Places of the path, of which the last ones are those of the first again."""
-    return [0, 1, 2, 3, 4, 5, 3, 1]
+OUT_AND_BACK = (0, 1, 2, 3, 4, 5, 3, 1)
+"""Places of the path, of which the last ones are those of the first again."""
 
 
 def looped(dive: Swim, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Keyframes over places of ``out_and_back``; returns how many there were at each adjustment of
+    """Keyframes over places of OUT_AND_BACK; returns how many there were at each adjustment of
     all of them, before the end."""
-    places, asked = out_and_back(), []
-    everything, truth, shown = dive.adjuster.everything, dive.truth, pictures()
-    dive.truth = [truth[place] for place in places]
-    monkeypatch.setattr(f"{__name__}.pictures", lambda: [shown[place] for place in places])
+    dive.places, asked = OUT_AND_BACK, []
+    everything = dive.adjuster.everything
     monkeypatch.setattr(
         dive.adjuster, "everything", lambda: (asked.append(len(dive.store)), everything())[1]
     )
-    for number in range(len(places)):
+    for number in range(len(dive.places)):
         dive.add(number)
     while dive.graph.optimising:
         dive.graph.correction(wait=True)

@@ -21,7 +21,7 @@ from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path
 POSES = lawn_path(12, step_m=0.12)
 
 
-SLOW_POSES = lawn_path(24, step_m=0.03)
+SLOW_POSES = lawn_path(19, step_m=0.03)
 
 
 def thinning(**settings: float) -> TrackingConfig:
@@ -73,7 +73,7 @@ def test_the_past_is_placed_frame_by_frame_and_as_well(clip: list[Frame]) -> Non
 
 
 def test_a_replay_follows_what_initialisation_left_out_from_keyframe_to_keyframe() -> None:
-    poses = lawn_path(24, step_m=0.06)
+    poses = lawn_path(15, step_m=0.09)
     until_the_end = thinning(max_waiting=3, parallax_widths=0.15)
     followed = run(filmed(SeaFloor(), poses), until_the_end)
     numbers = [tracked.keyframe for _, tracked in sorted(followed.by_index().items())]
