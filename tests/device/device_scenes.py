@@ -80,7 +80,7 @@ def mapped(device: torch.device, config: MappingConfig | None = None) -> Mapper:
         mapper.add_view(view)
         if number % 4 == 0:
             mapper.insert(view, flat_pointmap(camera=SMALL))
-        mapper.optimise(3)
+        mapper.optimise(2)
     mapper.move({0: pose((0.01, 0.0, 0.0))})
     mapper.optimise(2)
     return mapper

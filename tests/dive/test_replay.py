@@ -33,7 +33,7 @@ def rows(dive: Path) -> list[dict[str, str]]:
 
 def test_held_out_frames_are_tracked_and_never_mapped(small_recording: Path) -> None:
     few = dict.fromkeys(("refine_steps", "steps_keyframe", "steps_mapping", "steps_common"), 1)
-    config = Config.model_validate({"mapping": {"optimiser": few}})
+    config = Config.model_validate({"source": {"width": 96}, "mapping": {"optimiser": few}})
     recording = open_recording(small_recording)
     prepare, slam = Preparation(config.source, recording.camera), Slam(config)
     tracked = []

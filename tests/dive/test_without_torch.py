@@ -24,6 +24,7 @@ def test_a_dive_that_is_only_tracked_loads_no_torch(
     more: tuple[str, ...], small_recording: Path, tmp_path: Path
 ) -> None:
     arguments = ["map", str(small_recording), "--out", str(tmp_path / "dive"), "--tracking-only"]
+    arguments += ["--stop", "8"]
     ran = subprocess.run(
         [sys.executable, "-c", CODE, *arguments, "--json", *more],
         capture_output=True, text=True, check=True, timeout=240,

@@ -29,6 +29,7 @@ def killed(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     """The folder of a dive whose process was killed once a report had been written."""
     folder = tmp_path_factory.mktemp("killed")
     config = CONFIG.replace("{every_s: 1.0}", OFTEN).replace("mapping:\n", HELD_OUT, 1)
+    config = config.replace("source: {", "source: {width: 96, ")
     (folder / "vehicle.yaml").write_text(config)
     at = ("--killed-with-a-report-at", str(KILLED_AT))
     done = paced_run(small_recording, folder / "vehicle.yaml", folder / "dive", *at)

@@ -48,6 +48,12 @@ SETTINGS = Config.model_validate(
         },
     }
 )
+TRACKING = SETTINGS.model_copy(
+    update={"mapping": SETTINGS.mapping.model_copy(update={"enabled": False})}
+)
+"""Where nothing is said about the map."""
+MAPPED = 10
+"""Pictures that make a map."""
 
 STAGES: list[tuple[type | ModuleType, str, int, str]] = [
     (Preparation, "__call__", 3, "preparation"),
@@ -86,8 +92,15 @@ def raise_once(monkeypatch: pytest.MonkeyPatch) -> Callable[[type | ModuleType, 
     return patch
 
 
-def mapped(recording: RecordedCamera, out: Path, **keywords: Any) -> Finished:
-    return replay.map_recording(recording, "planted", out, SETTINGS, **keywords)
+def mapped(
+    recording: RecordedCamera, out: Path, settings: Config = SETTINGS, **keywords: Any
+) -> Finished:
+    return replay.map_recording(recording, "planted", out, settings, **keywords)
+
+
+def stopped(settings: Config, stop: int) -> Config:
+    """The same for the first ``stop`` pictures."""
+    return settings.model_copy(update={"source": settings.source.model_copy(update={"stop": stop})})
 
 
 def rows(dive: Path) -> list[dict[str, str]]:
@@ -126,7 +139,7 @@ def test_frames_that_a_failing_tracker_held_are_accounted_for(
 
     monkeypatch.setattr(Tracker, "_begin", lose_all)
     monkeypatch.setattr(Tracker, "_shown_somewhere", lambda *_: None)  # it finds them again
-    finished = mapped(open_recording(small_recording), tmp_path / "dive")
+    finished = mapped(open_recording(small_recording), tmp_path / "dive", TRACKING)
     table = rows(finished.dive)
     assert [int(row["index"]) for row in table] == list(range(len(table)))
     assert sum(row["class"] == "lost" for row in table) == finished.metrics["lost"] > 0
@@ -154,18 +167,19 @@ def test_reading_goes_on_after_a_frame_that_cannot_be_read(
     small_recording: Path, tmp_path: Path
 ) -> None:
     recording: Any = Unreliable(open_recording(small_recording), {5, 6, 11})
-    finished = mapped(recording, tmp_path / "dive")
+    finished = mapped(recording, tmp_path / "dive", stopped(TRACKING, 14))
     classes = {int(row["index"]): row["class"] for row in rows(finished.dive)}
     assert [index for index, kind in classes.items() if kind == "dropped"] == [5, 6, 11]
-    assert sorted(classes) == list(range(len(classes)))
+    assert sorted(classes) == list(range(14))
 
 
 def test_what_came_before_a_recordings_damaged_end_is_mapped(
     small_recording: Path, tmp_path: Path
 ) -> None:
-    recording: Any = Unreliable(open_recording(small_recording), set(range(14, 1000)))
+    recording: Any = Unreliable(open_recording(small_recording), set(range(MAPPED, 1000)))
     finished = mapped(recording, tmp_path / "dive")
-    assert finished.metrics["tracked"] == 14
+    assert finished.metrics["tracked"] == MAPPED
+    assert finished.metrics["gaussians"] > 0
     assert any("could not be read after frame" in note for note in finished.notes)
 
 
@@ -179,8 +193,13 @@ def test_a_progress_bar_that_breaks_does_not_matter(small_recording: Path, tmp_p
     def broken(stage: str, done: int, total: int | None) -> None:
         raise BrokenPipeError(32, "planted")
 
-    finished = mapped(open_recording(small_recording), tmp_path / "dive", progress=broken)
-    assert finished.metrics["tracked"] == finished.metrics["frames"]
+    finished = mapped(
+        open_recording(small_recording),
+        tmp_path / "dive",
+        stopped(SETTINGS, MAPPED),
+        progress=broken,
+    )
+    assert finished.metrics["tracked"] == finished.metrics["frames"] == MAPPED
 
 
 WRITERS = {
@@ -199,22 +218,38 @@ WRITERS = {
 }
 
 
+NAMES = tuple(WRITERS)
+CORE = 8
+"""The first of them make the dive's own files; the others read what is known of it."""
+TOGETHER = {
+    "every second": NAMES[::2], "the others": NAMES[1::2],
+    "core": NAMES[:CORE], "what is made of it": NAMES[CORE:],
+}  # fmt: skip
+"""Neighbours are in different ones, so that one that takes the next with it is seen."""
+
+
 @pytest.fixture(scope="module")
 def finished_slam(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Slam:
     """A dive whose frames have all been mapped, before anything of it is written."""
     recording = open_recording(small_recording)
     prepare = Preparation(SETTINGS.source, recording.camera)
     slam = Slam(SETTINGS, Stages(failures=Failures(strict=False)))
-    for frame in recording.frames(stop=12):
+    for frame in recording.frames(stop=MAPPED):
         assert isinstance(frame, Frame)
         slam.process(prepare(frame))
     slam.finish()
     return slam
 
 
-@pytest.mark.parametrize("broken", WRITERS)
-def test_a_file_that_cannot_be_written_leaves_the_others(
-    broken: str, finished_slam: Slam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "broken",
+    [
+        *(pytest.param(names, id=kind) for kind, names in TOGETHER.items()),
+        *(pytest.param((name,), id=name, marks=pytest.mark.slow) for name in NAMES),
+    ],
+)
+def test_files_that_cannot_be_written_leave_the_others(
+    broken: tuple[str, ...], finished_slam: Slam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise InputError("planted") from OSError(5, "planted")
@@ -222,10 +257,11 @@ def test_a_file_that_cannot_be_written_leaves_the_others(
     slam, folder = finished_slam, DiveFolder(tmp_path / "dive", SETTINGS)
     monkeypatch.setattr(slam, "failures", Failures(strict=False))
     others = deliverables_of(slam)
-    if broken in others:
-        monkeypatch.setattr(others[broken], "make", fail)
-    else:
-        monkeypatch.setattr(folder, broken, fail)
+    for name in broken:
+        if name in others:
+            monkeypatch.setattr(others[name], "make", fail)
+        else:
+            monkeypatch.setattr(folder, name, fail)
     made = Deliverables("planted", folder, slam, slam.results(), None, others=others)
     made.summarise()
     made.write()
@@ -235,10 +271,10 @@ def test_a_file_that_cannot_be_written_leaves_the_others(
     made.write_evaluation()
     made.make(DeliverablePhase.REPORT, metrics={"stage_ms": {}, "warnings": []})
     folder.close()
-    stage, missing = WRITERS[broken]
-    assert [kind.stage for kind in slam.failures.kinds] == [stage]
+    failed = dict(WRITERS[name] for name in broken)
+    assert {kind.stage for kind in slam.failures.kinds} == failed.keys()
     for _, name in WRITERS.values():
-        assert (folder.path / name).exists() == (name != missing), name
+        assert (folder.path / name).exists() == (name not in failed.values()), name
 
 
 def test_a_map_that_stays_empty_and_a_dive_of_few_poses_are_said_first(
@@ -246,6 +282,7 @@ def test_a_map_that_stays_empty_and_a_dive_of_few_poses_are_said_first(
 ) -> None:
     asked = SETTINGS.model_dump()
     asked["mapping"]["insertion"]["tau_a"] = 1.0
+    asked["source"]["stop"] = MAPPED
     recording, settings = open_recording(small_recording), Config.model_validate(asked)
     finished = replay.map_recording(recording, "empty", tmp_path / "dive", settings)
     [warning] = finished.warnings
