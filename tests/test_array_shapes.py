@@ -11,9 +11,11 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
+
+from tests.statements import STATEMENTS, statements
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("aquaflow", "drivers", "sim_drivers")
@@ -30,20 +32,28 @@ class Module:
     lines: list[str]
     tree: ast.Module
 
-    def imported(self) -> Iterator[tuple[str, str, str]]:
+    @cached_property
+    def imported(self) -> list[tuple[str, str, str]]:
         """Name here, module it comes from, name there."""
-        for node in ast.walk(self.tree):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                for each in node.names:
-                    yield each.asname or each.name, node.module, each.name
+        return [
+            (each.asname or each.name, node.module, each.name)
+            for node in statements(self.tree)
+            if isinstance(node, ast.ImportFrom) and node.module
+            for each in node.names
+        ]
 
-    def assigned(self) -> Iterator[tuple[str, ast.expr]]:
+    @cached_property
+    def assigned(self) -> list[tuple[str, set[str]]]:
+        """What may be an alias at the module's top, and the types that stand in it."""
+        found = []
         for node in self.tree.body:
             match node:
-                case ast.Assign(targets=[ast.Name(id=name)], value=value):
-                    yield name, value
-                case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
-                    yield name, value
+                case (
+                    ast.Assign(targets=[ast.Name(id=name)], value=value)
+                    | ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value)
+                ) if isinstance(value, ast.Subscript | ast.BinOp | ast.Name | ast.Attribute):
+                    found.append((name, set(named_types(value))))
+        return found
 
 
 @cache
@@ -78,14 +88,9 @@ def aliases(types: frozenset[str]) -> dict[str, set[str]]:
     while size < (size := sum(map(len, known.values()))):
         for name, module in modules().items():
             known[name] |= {
-                here for here, source, there in module.imported() if there in known.get(source, ())
+                here for here, source, there in module.imported if there in known.get(source, ())
             }
-            known[name] |= {
-                here
-                for here, value in module.assigned()
-                if isinstance(value, ast.Subscript | ast.BinOp | ast.Name | ast.Attribute)
-                and known[name].intersection(named_types(value))
-            }
+            known[name] |= {here for here, types_of in module.assigned if known[name] & types_of}
     return known
 
 
@@ -94,7 +99,7 @@ def functions(node: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
             yield child
-        else:
+        elif isinstance(child, STATEMENTS):
             yield from functions(child)
 
 

@@ -7,7 +7,10 @@ documented protocol.
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
+
+from tests.statements import statements
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("aquaflow", "drivers", "sim_drivers")
@@ -19,12 +22,13 @@ FRAMEWORK = {
 """Methods that a library asks for; its documentation says what they do."""
 
 
+@cache
 def classes() -> list[tuple[Path, ast.ClassDef]]:
     found = []
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"))
-            found += [(path, node) for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+            found += [(path, node) for node in statements(tree) if isinstance(node, ast.ClassDef)]
     return found
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+
+from tests.statements import statements
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -62,7 +65,7 @@ def family(module: Module) -> str:
 def imported(source: str, path: Path) -> set[Module]:
     """Every module of ours that ``source`` imports, at its top or inside a function."""
     found: set[Module] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in statements(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {tuple(alias.name.split(".")) for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -79,15 +82,21 @@ def imported(source: str, path: Path) -> set[Module]:
     return {module for module in found if module[0] in OWN}
 
 
-def violations(source: str, path: Path) -> list[str]:
-    """Sentences about every import of ``source`` that the floors do not allow."""
+@cache
+def imported_by(path: Path) -> set[Module]:
+    """Every module of ours that a file imports; each file is parsed once."""
+    return imported(path.read_text(), path)
+
+
+def violations(imports: set[Module], path: Path) -> list[str]:
+    """Sentences about every one of a module's ``imports`` that the floors do not allow."""
     mine = family(dotted(path))
     if dotted(path) == PACKAGE:
         return []
     if mine not in HEIGHT:
         return [f"{mine} has no floor; add it to FLOORS in this test"]
     problems = []
-    for module in sorted(imported(source, path)):
+    for module in sorted(imports):
         theirs = family(module)
         if theirs == mine or module == PACKAGE:
             continue
@@ -137,7 +146,7 @@ def folded(graph: Graph, folder: Module) -> Graph:
 def imported_tests(source: str) -> list[str]:
     """Test modules and conftest files that ``source`` imports."""
     names: list[Iterable[str]] = []
-    for node in ast.walk(ast.parse(source)):
+    for node in statements(ast.parse(source)):
         if isinstance(node, ast.Import):
             names += [alias.name.split(".") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -152,16 +161,15 @@ def imported_tests(source: str) -> list[str]:
 
 def graph_of_files() -> Graph:
     return {
-        module: {other for other in imported(path.read_text(), path) if other in FILES}
-        - {module, PACKAGE}
+        module: {other for other in imported_by(path) if other in FILES} - {module, PACKAGE}
         for module, path in FILES.items()
         if module != PACKAGE
     }
 
 
-@pytest.mark.parametrize("path", FILES.values(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_module_imports_only_from_floors_below_its_own(path: Path) -> None:
-    assert violations(path.read_text(), path) == []
+def test_a_module_imports_only_from_floors_below_its_own() -> None:
+    found = {path: violations(imported_by(path), path) for path in FILES.values()}
+    assert {path: problems for path, problems in found.items() if problems} == {}
 
 
 def test_every_module_is_looked_at() -> None:
@@ -191,7 +199,8 @@ def test_a_program_begins_below_everything_that_it_calls() -> None:
     early = [
         ".".join(module)
         for module, path in FILES.items()
-        for statement in ast.parse(path.read_text()).body[:-1]
+        if "__name__" in (source := path.read_text())
+        for statement in ast.parse(source).body[:-1]
         if isinstance(statement, ast.If) and "__name__" in ast.unparse(statement.test)
     ]
     assert early == []
@@ -204,9 +213,9 @@ def test_every_folder_stands_on_one_of_four_floors() -> None:
     assert {path.stem for path in (ROOT / "aquaflow").glob("*.py")} - {"__init__"} == LOOSE_MODULES
 
 
-@pytest.mark.parametrize("path", TESTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_test_imports_another_test(path: Path) -> None:
-    assert imported_tests(path.read_text()) == []
+def test_no_test_imports_another_test() -> None:
+    found = {path: imported_tests(path.read_text()) for path in TESTS}
+    assert {path: names for path, names in found.items() if names} == {}
 
 
 @pytest.mark.parametrize(
@@ -226,7 +235,7 @@ def test_no_test_imports_another_test(path: Path) -> None:
     ],
 )
 def test_an_import_from_above_or_the_side_is_found(path: str, source: str, problem: str) -> None:
-    [found] = violations(source, ROOT / path)
+    [found] = violations(imported(source, ROOT / path), ROOT / path)
     assert problem in found
 
 
@@ -242,7 +251,7 @@ def test_an_import_from_above_or_the_side_is_found(path: str, source: str, probl
     ],
 )
 def test_imports_from_below_or_from_the_same_family_are_allowed(path: str, source: str) -> None:
-    assert violations(source, ROOT / path) == []
+    assert violations(imported(source, ROOT / path), ROOT / path) == []
 
 
 def test_a_circle_is_found_between_modules_and_between_folders() -> None:

@@ -10,7 +10,11 @@ import torch
 
 from aquaflow.prior.onnx_file import write_onnx
 
-pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
+
+@pytest.fixture(scope="module", autouse=True)
+def _onnxscript() -> None:
+    """Its import takes seconds: only where a test runs, not where tests are collected."""
+    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
 
 
 def failing_with(cause: BaseException) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
@@ -30,6 +31,8 @@ SCALE_WANDER, WANDER_S = 0.003, 20.0
 """Relative size and correlation time of what the local scale does along a path."""
 GROUND_EVERY, GROUND_SIGMA_M = 2, 0.005
 """Share and noise of the relief's cells that become points of the map."""
+BESIDE_M = 3.0
+"""How far beside the path the map has ground: a camera sees no more, and no beam meets more."""
 TURN_RAD = np.radians(0.02)
 """Random walk of the orientation, in each root of a second."""
 
@@ -89,7 +92,8 @@ def ground_of(swum: Swum, seed: int = 0) -> Array:
     ground_s = np.column_stack([x, y, -heights[rows, columns].astype(np.float64)])
     ground_n = ground_s @ site.path.R_ws.T + site.path.t_ws
     ground_n += GROUND_SIGMA_M * rng.standard_normal(ground_n.shape)
-    return swum.T_nm.inverse().apply(ground_n)
+    away, _ = KDTree(dive.T_wc[::5, :2, 3]).query(ground_n[:, :2], distance_upper_bound=BESIDE_M)
+    return swum.T_nm.inverse().apply(ground_n[np.isfinite(away)])
 
 
 def stated_mounting(dive: SimulatedDive) -> MountingConfig:

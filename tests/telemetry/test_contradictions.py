@@ -32,7 +32,7 @@ def floor(dive: Swum) -> np.ndarray:
     places = dive.dive.T_wc[:, :3, 3]
     steps = np.linspace(-1.5, 1.5, 9)
     grid = np.array([[x, y, 0.0] for x in steps for y in steps])
-    points = (places[:, None] + grid).reshape(-1, 3)
+    points = (places[::3, None] + grid).reshape(-1, 3)
     points[:, 2] = places[:, 2].mean() + np.median(measured)
     return np.asarray(dive.T_nm.inverse().apply(points))
 

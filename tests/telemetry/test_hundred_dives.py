@@ -18,7 +18,7 @@ from tests.telemetry.simulated_dives import Swum, estimated, ground_of, swum, te
 Array = npt.NDArray[np.float64]
 
 KINDS = ("depth", "attitude", "velocity", "altitude")
-COUNTS = [3, pytest.param(100, marks=pytest.mark.slow)]
+COUNTS = [2, pytest.param(100, marks=pytest.mark.slow)]
 LARGEST_SIGMAS = 4.0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -144,16 +145,22 @@ def depth_map(camera: CameraModel, flat: bool) -> Array:
 # --- rendered pictures ----------------------------------------------------------------------------
 
 
+@cache
+def texture(seed: int) -> npt.NDArray[np.float32]:
+    """[TEXTURE_SIZE, TEXTURE_SIZE] grey values 0 to 255; made once, and only where one is seen."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE))
+    for sigma in (1.2, 3.0, 9.0):
+        layer = cv2.GaussianBlur(rng.normal(size=total.shape), (0, 0), sigma)
+        total += layer / layer.std()
+    return np.clip(127.0 + 32.0 * total, 0, 255).astype(np.float32)
+
+
 class SeaFloor:
     """A textured heightfield below z = 0; cameras look down at it along +z."""
 
     def __init__(self, seed: int = 0) -> None:
-        rng = np.random.default_rng(seed)
-        total = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE))
-        for sigma in (1.2, 3.0, 9.0):
-            layer = cv2.GaussianBlur(rng.normal(size=total.shape), (0, 0), sigma)
-            total += layer / layer.std()
-        self._texture = np.clip(127.0 + 32.0 * total, 0, 255).astype(np.float32)
+        self.seed = seed
 
     @staticmethod
     def height(x: Array, y: Array) -> Array:
@@ -173,7 +180,7 @@ class SeaFloor:
         X = T_wc.t + self.depth(T_wc, camera)[..., None] * directions
         xy = (X[..., :2] * TEXELS_PER_M + TEXTURE_SIZE / 2).astype(np.float32)
         grey = cv2.remap(
-            self._texture, xy[..., 0], xy[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP
+            texture(self.seed), xy[..., 0], xy[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP
         )
         return np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 

@@ -29,10 +29,15 @@ from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 pytestmark = pytest.mark.ci
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
-pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
 
 WIDTH, HEIGHT = 48, 32
 CPU = RuntimeSettings(device="cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _onnxscript() -> None:
+    """Its import takes seconds: only where a test runs, not where tests are collected."""
+    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
 
 
 def silent(stage: str, done: int, total: int) -> None:
