@@ -232,7 +232,7 @@ def replaced(path: Path, name: str, dtype: object, count: int) -> None:
 PLACES_BOMBS = {"index": 3_000_000, "edges": 1_000_000, "about": 1 << 29}
 
 
-@pytest.mark.parametrize("name", PLACES_BOMBS)
+@pytest.mark.parametrize("name", ["edges", "about", pytest.param("index", marks=pytest.mark.slow)])
 def test_places_that_unpack_to_gigabytes_take_no_memory(dive: Path, name: str) -> None:
     from aquaflow.keyframes.place import EDGE, PLACE
 

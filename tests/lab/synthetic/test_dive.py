@@ -24,7 +24,7 @@ from aquaflow.lab.synthetic.path import Path as Way
 from aquaflow.lab.synthetic.render import SyntheticScene
 from aquaflow.lab.synthetic.water import WATER_TYPES
 
-SMALL = SyntheticConfig(frames=20, width=160, height=120)
+SMALL = SyntheticConfig(frames=10, width=160, height=120)
 SHORT = SyntheticConfig(frames=2, width=64, height=48)
 BARE = {"supersampling": 1, "snow_per_m3": 0.0, "vignette": 0.0, "noise_sigma": 0.0}
 

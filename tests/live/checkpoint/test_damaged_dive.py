@@ -19,7 +19,7 @@ from tests.command_line import Cli, refused
 from tests.live.damaged_dives import Outcome, gone_on_with, killed_dive, many, readable
 from tests.live.live_scenes import VEHICLE, ToldFeed
 
-SAMPLED = 6
+SAMPLED = 3
 
 
 @pytest.fixture(scope="module")
