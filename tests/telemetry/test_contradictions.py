@@ -17,12 +17,13 @@ from aquaflow.types import KIND_OF, Altitude, Attitude, Depth, TelemetrySample, 
 from tests.telemetry.simulated_dives import Swum, estimated, swum
 
 Change = Callable[[TelemetrySample], TelemetrySample]
-ALL = ("depth", "attitude", "velocity", "altitude")
+WITHOUT_ALTITUDE = ("depth", "attitude", "velocity")
+ALL = (*WITHOUT_ALTITUDE, "altitude")
 
 
 @pytest.fixture(scope="module")
 def dive() -> Swum:
-    return swum(SyntheticConfig(seed=1, frames=160, fps=4.0), *ALL)
+    return swum(SyntheticConfig(seed=1, frames=160, fps=4.0, scene="flat_sand"), *ALL)
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +80,14 @@ def left_out(estimate: Estimate) -> dict[str, SourceReport]:
     return {each.kind: each for each in estimate.frame.sources if not each.used}
 
 
-@pytest.mark.parametrize("kinds", [ALL, ("depth", "attitude", "velocity")])
 @pytest.mark.parametrize(
-    ("change", "kind", "times"), [(in_wrong_units, "velocity", 1.5), (in_feet, "depth", 3.28)]
+    ("change", "kind", "times", "kinds"),
+    [
+        (in_wrong_units, "velocity", 1.5, WITHOUT_ALTITUDE),
+        (in_feet, "depth", 3.28, ALL),
+        pytest.param(in_wrong_units, "velocity", 1.5, ALL, marks=pytest.mark.slow),
+        pytest.param(in_feet, "depth", 3.28, WITHOUT_ALTITUDE, marks=pytest.mark.slow),
+    ],
 )
 def test_a_source_in_wrong_units_is_left_out(
     dive: Swum, floor: np.ndarray, change: Change, kind: str, times: float, kinds: tuple[str, ...]

@@ -41,6 +41,7 @@ def dive(seed: int) -> Swum:
         SyntheticConfig.model_validate(
             {
                 "seed": seed, "frames": 660, "fps": 10, "width": 64, "height": 48,
+                "scene": "flat_sand",
                 "altitude_m": 2.0, "altitude_swing_m": float(rng.uniform(0.4, 1.0)),
                 "speed_m_s": float(rng.uniform(0.3, 0.7)),
                 "mounting_error_deg": float(rng.uniform(0.0, 4.0)),
@@ -61,10 +62,17 @@ def one(swum: Swum, path: CameraPath, heading: bool, carried: Carried | None = N
     return estimate(swum.telemetry, path, settings, mounting, lambda: NOTHING, carried=carried)
 
 
-def carried(swum: Swum, telemetry: Telemetry | None = None) -> Carried | None:
-    first, second = parts(swum)
-    before = one(swum, first, heading=True)
-    return carried_from(before, first, telemetry or swum.telemetry, second)
+@functools.cache
+def before_it(seed: int, heading: bool) -> Estimate:
+    """Of a dive's first sub-map."""
+    return one(dive(seed), parts(dive(seed))[0], heading)
+
+
+def carried(telemetry: Telemetry | None = None) -> Carried | None:
+    """Across the blackout of dive 0."""
+    first, second = parts(dive(0))
+    before = before_it(0, heading=True)
+    return carried_from(before, first, telemetry or dive(0).telemetry, second)
 
 
 @pytest.mark.parametrize("heading", [True, False])
@@ -80,7 +88,7 @@ def test_after_20_s_of_blackout_the_next_sub_map_lies_within_its_stated_3_sigma(
     for seed in seeds:
         made = dive(seed)
         first, second = parts(made)
-        before = one(made, first, heading)
+        before = before_it(seed, heading)
         after = one(made, second, heading, carried_from(before, first, made.telemetry, second))
         assert after.frame.metric
         assert any(each.kind == "dead_reckoning" for each in after.frame.sources)
@@ -111,32 +119,31 @@ def level_alignment(
 
 def test_without_a_dvl_no_place_is_carried_but_the_mounting_is() -> None:
     made = dive(0)
-    found = carried(made, telemetry_of(made.dive, "depth", "attitude"))
+    found = carried(telemetry_of(made.dive, "depth", "attitude"))
     assert found is not None
     assert found.place is None
-    first, second = parts(made)
-    after = one(made, second, heading=True, carried=found)
+    after = one(made, parts(made)[1], heading=True, carried=found)
     assert not any(each.kind == "dead_reckoning" for each in after.frame.sources)
-    before = one(made, first, heading=True)
+    before = before_it(0, heading=True)
     assert before.solution is not None
     np.testing.assert_array_equal(found.state.R_bc, before.solution.state.R_bc)
 
 
 def test_without_attitude_no_place_is_carried() -> None:
-    found = carried(dive(0), telemetry_of(dive(0).dive, "depth", "velocity"))
+    found = carried(telemetry_of(dive(0).dive, "depth", "velocity"))
     assert found is not None
     assert found.place is None
 
 
 def test_a_dvl_that_was_silent_for_long_gives_no_place() -> None:
-    found = carried(dive(0), without_bottom_lock(dive(0), 3.0, 17.0))
+    found = carried(without_bottom_lock(dive(0), 3.0, 17.0))
     assert found is not None
     assert found.place is None
 
 
 def test_a_silence_that_is_bridged_widens_the_sigma() -> None:
     made = dive(0)
-    whole, bridged = carried(made), carried(made, without_bottom_lock(made, 5.0, 12.0))
+    whole, bridged = carried(), carried(without_bottom_lock(made, 5.0, 12.0))
     assert whole is not None
     assert bridged is not None
     assert whole.place is not None
@@ -157,7 +164,7 @@ def without_bottom_lock(made: Swum, first_s: float, last_s: float) -> Telemetry:
 def test_nothing_is_carried_from_a_sub_map_without_metres() -> None:
     made = dive(0)
     first, second = parts(made)
-    before = one(made, first, heading=True)
+    before = before_it(0, heading=True)
     for frame in (WorldFrame.unknown(), replace(before.frame, level=False)):
         assert carried_from(replace(before, frame=frame), first, made.telemetry, second) is None
     nothing = CameraPath(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))

@@ -59,7 +59,7 @@ def dive() -> Swum:
 
 @pytest.fixture(scope="module")
 def turning() -> Swum:
-    return swum(config(turns=True, roll_deg=8.0, pitch_deg=8.0), *ALL)
+    return swum(config(turns=True, roll_deg=8.0, pitch_deg=8.0, scene="flat_sand"), *ALL)
 
 
 def report(found: Estimate, kind: str) -> SourceReport:

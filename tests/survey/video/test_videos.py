@@ -20,6 +20,7 @@ from aquaflow.mapping.restoration import to_bytes
 from aquaflow.survey.video.every_frame import (
     LONGEST_GAP_S,
     CameraPoses,
+    EveryFrame,
     restore_every_frame,
     side_by_side,
 )
@@ -126,27 +127,33 @@ def test_without_a_recording_the_map_is_on_the_left(small_dive: Path, tmp_path: 
     assert difference(first[:HEIGHT, :WIDTH], drawn) < LOST_IN_VIDEO
 
 
-@pytest.fixture
-def gaps(small_dive: Path, tmp_path: Path) -> Path:
-    """The small dive, of which every other pose and the last three are missing."""
-    folder = tmp_path / "gaps"
+Restored = tuple[Path, EveryFrame, list[tuple[int, int]]]
+"""A video, what was said of it, and its steps of progress."""
+
+
+@pytest.fixture(scope="module")
+def with_gaps(
+    small_dive: Path, small_recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Restored:
+    """Of the small dive, of which every other pose and the last three are missing."""
+    folder = tmp_path_factory.mktemp("gaps") / "dive"
     shutil.copytree(small_dive, folder)
     lines = (folder / "trajectory.tum").read_text().splitlines()
     head = [line for line in lines if line.startswith("#")]
     poses = [line for line in lines if not line.startswith("#")]
     assert len(poses) == FRAMES
     (folder / "trajectory.tum").write_text("\n".join([*head, *poses[:-3:2]]) + "\n")
-    return folder
+    path, steps = folder.with_name("all.mp4"), list[tuple[int, int]]()
+    wrote = restore_every_frame(
+        Dive(folder), path, small_recording, progress=lambda *step: steps.append(step)
+    )
+    return path, wrote, steps
 
 
 def test_every_frame_is_restored_from_a_pose_in_between(
-    gaps: Path, small_recording: Path, restored: dict[int, Picture], tmp_path: Path
+    with_gaps: Restored, restored: dict[int, Picture]
 ) -> None:
-    path = tmp_path / "all.mp4"
-    steps: list[tuple[int, int]] = []
-    wrote = restore_every_frame(
-        Dive(gaps), path, small_recording, progress=lambda *step: steps.append(step)
-    )
+    path, wrote, steps = with_gaps
     found = pictures_of(path)
     assert (wrote.frames, wrote.restored) == (FRAMES, FRAMES - 3)
     assert len(found) == FRAMES
@@ -159,10 +166,9 @@ def test_every_frame_is_restored_from_a_pose_in_between(
 
 
 def test_a_frame_without_a_pose_is_shown_as_it_is_with_a_mark(
-    gaps: Path, small_recording: Path, tmp_path: Path
+    with_gaps: Restored, small_recording: Path
 ) -> None:
-    restore_every_frame(Dive(gaps), tmp_path / "all.mp4", small_recording)
-    last = pictures_of(tmp_path / "all.mp4")[-1]
+    last = pictures_of(with_gaps[0])[-1]
     recorded = cv2.imread(str(sorted((small_recording / "images").iterdir())[-1]))[..., ::-1]
     assert difference(last[HEIGHT // 4 :], recorded[HEIGHT // 4 :]) < LOST_IN_VIDEO
     corner = last[:9, :40].astype(int)
