@@ -51,7 +51,7 @@ def full_jacobian(factor: Factor, state: MetricState) -> Array:
 
 
 @pytest.mark.parametrize("flat", [False, True])
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(seed=SEEDS)
 def test_residuals_are_zero_at_the_truth(flat: bool, seed: int) -> None:
     scene = ExactScene.drawn(seed, flat)
@@ -66,7 +66,7 @@ def test_residuals_are_zero_at_the_truth(flat: bool, seed: int) -> None:
 
 
 @pytest.mark.parametrize("flat", [False, True])
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(seed=SEEDS)
 def test_derivatives_are_true_and_no_parameter_is_forgotten(flat: bool, seed: int) -> None:
     scene = ExactScene.drawn(seed, flat)
@@ -82,7 +82,7 @@ def test_derivatives_are_true_and_no_parameter_is_forgotten(flat: bool, seed: in
 
 
 @given(seed=SEEDS)
-@settings(max_examples=10)
+@settings(max_examples=4)
 def test_the_turn_that_is_wanted_levels_the_body(seed: int) -> None:
     scene = ExactScene.drawn(seed)
     tilt = next(f for f in scene.factors() if type(f) is TiltFactor)

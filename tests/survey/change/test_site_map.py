@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,12 @@ def gaussians(
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("views")
+
+
+@cache
 def sharp_views(box: tuple[float, float] | None, work: Path) -> ViewSurfaces:
     """Of cameras whose pixels are 5 mm wide on the ground: the box is higher than dives differ."""
     return views_of(box, work, SHARP)
@@ -58,8 +65,8 @@ def seen(part: PlyGaussians) -> npt.NDArray[np.bool_]:
 
 
 @pytest.fixture
-def bare(tmp_path: Path) -> Callable[[str], DayMap]:
-    return lambda name: DayMap(name, gaussians(None), sharp_views(None, tmp_path))
+def bare(work: Path) -> Callable[[str], DayMap]:
+    return lambda name: DayMap(name, gaussians(None), sharp_views(None, work))
 
 
 def test_of_a_place_that_both_show_the_later_stays_and_elsewhere_each(
@@ -74,8 +81,8 @@ def test_of_a_place_that_both_show_the_later_stays_and_elsewhere_each(
     assert (monday.gone, tuesday.gone, tuesday.replaced) == (0, 0, 0)
 
 
-def test_what_a_later_dive_sees_past_is_gone(bare: Callable[[str], DayMap], tmp_path: Path) -> None:
-    monday = DayMap("monday", gaussians(BOX), sharp_views(BOX, tmp_path))
+def test_what_a_later_dive_sees_past_is_gone(bare: Callable[[str], DayMap], work: Path) -> None:
+    monday = DayMap("monday", gaussians(BOX), sharp_views(BOX, work))
     before, after = combine([monday, bare("tuesday")])
     assert before.gone == (gaussians(BOX).means[:, 2] == TALL).sum()
     assert not (before.gaussians.means[:, 2] > 0.5 * TALL).any()
@@ -83,9 +90,9 @@ def test_what_a_later_dive_sees_past_is_gone(bare: Callable[[str], DayMap], tmp_
 
 
 def test_what_is_new_stays_and_hides_what_was_there(
-    bare: Callable[[str], DayMap], tmp_path: Path
+    bare: Callable[[str], DayMap], work: Path
 ) -> None:
-    tuesday = DayMap("tuesday", gaussians(BOX), sharp_views(BOX, tmp_path))
+    tuesday = DayMap("tuesday", gaussians(BOX), sharp_views(BOX, work))
     before, after = combine([bare("monday"), tuesday])
     assert after.gone == after.replaced == 0
     assert (after.gaussians.means[near(after.gaussians, BOX), 2] == TALL).all()
@@ -94,29 +101,29 @@ def test_what_is_new_stays_and_hides_what_was_there(
     assert (hidden[:, 2] < 0.02).all()
 
 
-def test_a_look_from_afar_replaces_no_close_one_whichever_is_later(tmp_path: Path) -> None:
-    close = DayMap("close", gaussians(None), sharp_views(None, tmp_path))
-    far = DayMap("far", gaussians(None), from_afar(tmp_path))
+def test_a_look_from_afar_replaces_no_close_one_whichever_is_later(work: Path) -> None:
+    close = DayMap("close", gaussians(None), sharp_views(None, work))
+    far = DayMap("far", gaussians(None), from_afar(work))
     for days in ([close, far], [far, close]):
         parts = {part.name: part.gaussians for part in combine(days)}
         assert seen(parts["close"]).sum() == seen(close.gaussians).sum()
         assert not seen(parts["far"]).any()
 
 
-def test_a_look_from_afar_sees_what_is_gone(tmp_path: Path) -> None:
+def test_a_look_from_afar_sees_what_is_gone(work: Path) -> None:
     mast = gaussians(None)
     at_mast = np.hypot(*mast.means[:, :2].T) < 0.05
     mast.means[at_mast, 2] = 1.5
-    close = DayMap("monday", mast, sharp_views(None, tmp_path))
-    before, _ = combine([close, DayMap("tuesday", gaussians(None), from_afar(tmp_path))])
+    close = DayMap("monday", mast, sharp_views(None, work))
+    before, _ = combine([close, DayMap("tuesday", gaussians(None), from_afar(work))])
     assert before.gone == at_mast.sum()
     assert not (before.gaussians.means[:, 2] > 1.0).any()
 
 
-def test_earlier_colours_get_the_light_of_later_ones(tmp_path: Path) -> None:
+def test_earlier_colours_get_the_light_of_later_ones(work: Path) -> None:
     light = np.array((1.25, 0.8, 0.7))
-    monday = DayMap("monday", gaussians(None), sharp_views(None, tmp_path))
-    tuesday = DayMap("tuesday", gaussians(None, tuple(light)), sharp_views(None, tmp_path))
+    monday = DayMap("monday", gaussians(None), sharp_views(None, work))
+    tuesday = DayMap("tuesday", gaussians(None, tuple(light)), sharp_views(None, work))
     before, after = combine([monday, tuesday])
     assert np.allclose(before.gains, light, rtol=1e-6)
     assert after.gains == (1.0, 1.0, 1.0)
@@ -125,13 +132,13 @@ def test_earlier_colours_get_the_light_of_later_ones(tmp_path: Path) -> None:
     assert np.allclose(before.gaussians.colours, expected, rtol=1e-5)
 
 
-def test_dives_over_different_ground_keep_all_and_their_own_colours(tmp_path: Path) -> None:
+def test_dives_over_different_ground_keep_all_and_their_own_colours(work: Path) -> None:
     far_away = Sim3(np.eye(3), np.array([50.0, 0.0, 0.0]))
     elsewhere = [far_away @ pose for pose in above_plane()]
-    monday = DayMap("monday", gaussians(None), sharp_views(None, tmp_path))
+    monday = DayMap("monday", gaussians(None), sharp_views(None, work))
     tuesday = DayMap(
         "tuesday", gaussians(None, (2, 2, 2)).transform(far_away),
-        surfaces_of(elsewhere, [to_plane] * 5, tmp_path, SHARP),
+        surfaces_of(elsewhere, [to_plane] * 5, work, SHARP),
     )  # fmt: skip
     for part in combine([monday, tuesday]):
         assert len(part.gaussians.means) == len(gaussians(None).means)
