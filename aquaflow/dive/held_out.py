@@ -14,8 +14,9 @@ from aquaflow.dive.held_out_example import Fidelity, HeldOut
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import (
     RestoredPicture,
-    common_exposure,
+    ShownTone,
     restored_picture,
+    restored_tone,
     to_bytes,
 )
 from aquaflow.mapping.scene import RenderedMap
@@ -37,17 +38,15 @@ def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) ->
     if mapper is None or len(mapper.gaussians) == 0:
         return []
     views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
-    contain, exposure = slam.failures.contain, 1.0
+    contain, tone = slam.failures.contain, ShownTone()
     views, as_tracked = _register_views(slam, mapper, views, until or Deadline())
-    with contain("restored exposure"):
-        exposure = common_exposure(
-            restored_picture(mapper.scene, view, mapper.show(view)).image for view in views
-        )
+    with contain("restored tone"):
+        tone = restored_tone(mapper)
     examined = []
     for view in views:
         with contain("evaluation", view.frame_index):
             before = as_tracked.get(view.frame_index)
-            examined.append(replace(_examine(mapper, view, exposure), as_tracked=before))
+            examined.append(replace(_examine(mapper, view, tone), as_tracked=before))
     return examined
 
 
@@ -88,7 +87,7 @@ def spread(count: int) -> list[int]:
     return sorted(range(count), key=lambda place: f"{place:0{digits}b}"[::-1])
 
 
-def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
+def _examine(mapper: Mapper, view: View, tone: ShownTone) -> HeldOut:
     shown = mapper.show(view)
     rendered, real = _pictures(view, shown)
     restored: RestoredPicture | None = None
@@ -100,7 +99,7 @@ def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
         view.frame_index,
         view.image,
         to_bytes(rendered),
-        None if restored is None else restored.picture_bytes(exposure),
+        None if restored is None else restored.picture_bytes(tone),
         psnr(rendered, real),
         ssim(rendered, real),
         perceptual,

@@ -20,7 +20,7 @@ from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_fac
 from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.dive.results import WaterSummary
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import restored_gaussians
+from aquaflow.mapping.restoration import restored_gaussians, restored_tone
 from aquaflow.mapping.state import deserialise, serialise
 from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.transfers import map_out, picture_out, water_in, water_out
@@ -168,7 +168,7 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
     if len(z) == 0:
         return None
     low, high = np.percentile(picture_out(z), RANGE_PERCENTILES)
-    first = waters[0]
+    first, tone = waters[0], restored_tone(mapper)
     summary = WaterSummary(
         water_out(torch.stack([water.beta_a for water in waters]).mean(0)).tolist(),
         water_out(first.b).tolist(),
@@ -184,6 +184,8 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),
         mapper.scene.unevenness().tolist(),
+        tone.exposure,
+        tone.compression,
     )
     numbers = (low, high, summary.range_median, *summary.beta_a, *summary.B_inf, *summary.b)
     if not np.isfinite(numbers).all():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import whole_folder
@@ -20,18 +19,16 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import (
     RestoredPicture,
-    common_exposure,
+    ShownTone,
     drawn_without_water,
     restored_picture,
+    restored_tone,
 )
 from aquaflow.mapping.scene import RenderedMap
 from aquaflow.render.views import View, in_time
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.types import Frame
-
-LOOKS = 20
-"""Frames, spread over the dive, that the common exposure is judged by."""
 
 Progress = Callable[[int, int], None]
 
@@ -50,10 +47,10 @@ def export_restored(
         ConfigError: the dive's settings cannot be read.
     """
     mapper = dive.map()
-    exposure, count = exposure_without_water(dive, mapper), 0
+    tone, count = tone_without_water(dive, mapper), 0
     with whole_folder(out) as made:
         for index, picture in restored_frames(dive, mapper, recording):
-            write_png(made / f"{index:06d}.png", picture.picture_bytes(exposure))
+            write_png(made / f"{index:06d}.png", picture.picture_bytes(tone))
             if recording is not None:
                 write_png(made / f"{index:06d}_confidence.png", picture.confidence_bytes())
             count += 1
@@ -62,8 +59,8 @@ def export_restored(
     return count
 
 
-def exposure_without_water(dive: Dive, mapper: Mapper) -> float:
-    """The one gain of all restored pictures of ``dive``, whose map is ``mapper``.
+def tone_without_water(dive: Dive, mapper: Mapper) -> ShownTone:
+    """What all restored pictures of ``dive``, whose map is ``mapper``, are shown in.
 
     Raises:
         InputError: there is no water in the map.
@@ -72,17 +69,7 @@ def exposure_without_water(dive: Dive, mapper: Mapper) -> float:
         raise InputError(
             f"{dive} has no water to remove: it was found clear, or mapping.medium.enabled was off"
         )
-    return exposure_of_looks(mapper)
-
-
-@torch.no_grad()
-def exposure_of_looks(mapper: Mapper) -> float:
-    """The one gain at which the map's clean radiance is shown, judged by some of its views."""
-    shown = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
-    scene = mapper.scene
-    return common_exposure(
-        drawn_without_water(scene, view, mapper.show(view)).image for view in shown
-    )
+    return restored_tone(mapper)
 
 
 @dataclass(frozen=True)
@@ -269,6 +256,6 @@ def _pictures_seen(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictur
 
 
 def _without_water(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
-    exposure = exposure_without_water(dive, mapper)
+    tone = tone_without_water(dive, mapper)
     frames = restored_frames(dive, mapper, recording)
-    return ((index, picture.picture_bytes(exposure)) for index, picture in frames)
+    return ((index, picture.picture_bytes(tone)) for index, picture in frames)

@@ -57,6 +57,10 @@ class WaterSummary:
     """Log-gain of the camera over the picture: x, y, x^2, x y, y^2 with x, y from -1 to 1."""
     unevenness: list[float]
     """Log-gain of the backscatter over the picture, in the same terms."""
+    exposure: float
+    """One gain of all restored pictures and orthos, on top of ``white_gain``."""
+    highlight_compression: float
+    """Of their highlights, see :class:`aquaflow.mapping.restoration.ShownTone`."""
 
 
 def largest_sub_map(results: list[Tracked]) -> int:
@@ -179,6 +183,8 @@ def medium_json(
         "identifiable": water.beta_a_sigma is not None,
         "restored": {
             "gain": water.white_gain,
+            "exposure": water.exposure,
+            "highlight_compression": water.highlight_compression,
             "white_balance": "as the camera saw what was at near_range",
             "near_range": water.near_range,
             "amplification": amplification

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.mapping.restoration import restored_picture
+from aquaflow.mapping.restoration import ShownTone, restored_picture
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
 from aquaflow.render.transfers import insertion_in
@@ -32,7 +32,7 @@ def fitted(where: torch.device, dimmed: bool) -> tuple[Scene, list[Any]]:
     assert fit_water(scene, views, torch.Generator().manual_seed(0)) is not None
     rebalance(scene)
     restored = restored_picture(scene, views[0], scene.show(views[0]))
-    return scene, [restored.picture_bytes(0.9), restored.confidence_bytes()]
+    return scene, [restored.picture_bytes(ShownTone(0.9)), restored.confidence_bytes()]
 
 
 @pytest.mark.parametrize("dimmed", [False, True])

@@ -17,7 +17,7 @@ from aquaflow.sources import open_recording
 from tests.device.device_scenes import ALL_PARTS
 from tests.device.gsplats_place import machine_with
 
-FRAMES, DIMMED_AT = 9, 5
+FRAMES, DIMMED_AT = 11, 5
 PICTURES = {
     "frames": FRAMES, "width": 80, "height": 60, "supersampling": 1, "camera_pitch_deg": 55.0,
 }  # fmt: skip

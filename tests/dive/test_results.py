@@ -114,6 +114,8 @@ def test_a_summary_becomes_the_water_it_describes() -> None:
         beta_a_sigma=None,
         shading=[0.0] * 5,
         unevenness=[0.0] * 5,
+        exposure=1.0,
+        highlight_compression=0.0,
     )
     water = water_of(summary)
     z = torch.tensor([1.0])

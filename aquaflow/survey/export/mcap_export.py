@@ -22,7 +22,7 @@ from aquaflow.dive.deliverables import (
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.point_cloud import read_point_cloud
-from aquaflow.dive.restored import SeenFrame, exposure_without_water, seen_frames, without_water
+from aquaflow.dive.restored import SeenFrame, seen_frames, tone_without_water, without_water
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.topics import (
     ALTITUDE,
@@ -50,7 +50,7 @@ from aquaflow.dive.ros.topics import (
     require_rosbags,
 )
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import to_bytes
+from aquaflow.mapping.restoration import ShownTone, to_bytes
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
 
@@ -225,7 +225,8 @@ class _Pictures:
     def __init__(self, source: _Source, progress: Progress | None) -> None:
         mapper = source.mapper
         self._source, self._progress, self._done = source, progress, 0
-        self._exposure = exposure_without_water(source.dive, mapper) if source.has_water else 1.0
+        has_water = source.has_water
+        self._tone = tone_without_water(source.dive, mapper) if has_water else ShownTone()
         self._seen: Iterator[SeenFrame] = seen_frames(source.dive, mapper, source.recording)
         self._next = next(self._seen, None)
 
@@ -241,7 +242,7 @@ class _Pictures:
         if seen.picture is not None:
             shown[topics.CAMERA] = seen.picture
         if source.has_water:
-            restored = without_water(source.mapper, seen).picture_bytes(self._exposure)
+            restored = without_water(source.mapper, seen).picture_bytes(self._tone)
             shown[topics.RESTORED] = restored[..., :3]
         for topic, picture in shown.items():
             file.write(topic, t_ns, messages.jpeg(t_ns, OPTICAL, picture))

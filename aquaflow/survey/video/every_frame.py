@@ -17,9 +17,9 @@ from aquaflow.dive.deliverables import FinishedFrame, read_finished_frames
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import (
     SeenFrame,
-    exposure_without_water,
     preparation_of,
     seen_frames,
+    tone_without_water,
     without_water,
 )
 from aquaflow.geometry.similarity import Sim3
@@ -100,7 +100,7 @@ def restore_every_frame(
     """
     check_name(path)
     mapper = dive.map()
-    exposure = exposure_without_water(dive, mapper)
+    tone = tone_without_water(dive, mapper)
     frames = sorted(read_finished_frames(dive), key=lambda frame: frame.row.index)
     if not frames:
         raise InputError(f"{dive} has no frames; map the dive again")
@@ -118,7 +118,7 @@ def restore_every_frame(
             else:
                 view = light.view(frame, T_wc)
                 seen = SeenFrame(view, picture, mapper.show(view))
-                picture = without_water(mapper, seen).picture_bytes(exposure)[..., :3]
+                picture = without_water(mapper, seen).picture_bytes(tone)[..., :3]
                 restored += 1
             timeline.show(t_ns * 1e-9, picture)
             count += 1
@@ -207,7 +207,7 @@ def side_by_side(
     """
     check_name(path)
     mapper = dive.map()
-    exposure = exposure_without_water(dive, mapper)
+    tone = tone_without_water(dive, mapper)
     frames = _by_index(read_finished_frames(dive))
     shown = [view.frame_index for view in in_time(mapper.views)]
     if not shown or any(index not in frames for index in shown):
@@ -224,7 +224,7 @@ def side_by_side(
             picture = seen.picture
             if picture is None:
                 picture = to_bytes(picture_out(seen.shown.image))
-            clear = without_water(mapper, seen).picture_bytes(exposure)[..., :3]
+            clear = without_water(mapper, seen).picture_bytes(tone)[..., :3]
             words = words_of(frame.row.t_s, frame.known, north)
             timeline.show(frame.row.t_s, _compose(picture, clear, left, words))
             if progress is not None:

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.dive.point_cloud import read_point_cloud, read_posed_views
-from aquaflow.dive.restored import exposure_without_water, restored_frames
+from aquaflow.dive.restored import restored_frames, tone_without_water
 from aquaflow.dive.ros.topics import LASTING, TYPES
 from aquaflow.survey.export.mcap_export import export_mcap
 from tests.command_line import Cli, refused
@@ -207,9 +207,9 @@ def test_pictures_are_those_of_the_camera_the_map_and_the_restoration(
     messages: Messages, dive: Path, small_recording: Path
 ) -> None:
     mapper = Dive(dive).map()
-    exposure = exposure_without_water(Dive(dive), mapper)
+    tone = tone_without_water(Dive(dive), mapper)
     restored = [
-        picture.picture_bytes(exposure)
+        picture.picture_bytes(tone)
         for _, picture in restored_frames(Dive(dive), mapper, small_recording)
     ]
     found = messages["/camera/restored/compressed"]

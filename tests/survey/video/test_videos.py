@@ -15,7 +15,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.dive.deliverables import read_finished_frames
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.restored import exposure_without_water, restored_frames, seen_frames
+from aquaflow.dive.restored import restored_frames, seen_frames, tone_without_water
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.survey.video.every_frame import (
     LONGEST_GAP_S,
@@ -60,9 +60,9 @@ def difference(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> float:
 def restored(small_dive: Path, small_recording: Path) -> dict[int, Picture]:
     """The restored mapped frames by index."""
     mapper = Dive(small_dive).map()
-    exposure = exposure_without_water(Dive(small_dive), mapper)
+    tone = tone_without_water(Dive(small_dive), mapper)
     return {
-        index: picture.picture_bytes(exposure)[..., :3]
+        index: picture.picture_bytes(tone)[..., :3]
         for index, picture in restored_frames(Dive(small_dive), mapper, small_recording)
     }
 
@@ -222,8 +222,8 @@ def test_a_flight_begins_with_what_the_first_frame_shows(
     seen = next(seen_frames(Dive(small_dive), mapper, None))
     shown = to_bytes(seen.shown.image.numpy())
     if not water:
-        exposure = exposure_without_water(Dive(small_dive), mapper)
-        shown = next(restored_frames(Dive(small_dive), mapper, None))[1].picture_bytes(exposure)
+        tone = tone_without_water(Dive(small_dive), mapper)
+        shown = next(restored_frames(Dive(small_dive), mapper, None))[1].picture_bytes(tone)
     # The camera's way is smoothed and colours are bounded: the scene is the same, not every pixel.
     assert difference(found[0], shown[..., :3]) < 12.0
     assert difference(found[0], found[-1]) > 5.0

@@ -17,9 +17,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from aquaflow.dive.map_file import splats_of
-from aquaflow.dive.restored import exposure_of_looks
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
+from aquaflow.mapping.restoration import (
+    ShownTone,
+    mean_water,
+    restored_radiance,
+    restored_tone,
+    to_bytes,
+)
 from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
 from aquaflow.survey.export.ortho.grid import Grid, GridTile
@@ -157,7 +162,7 @@ class Colours:
         look through, in the ground's unit, or None for no water."""
         self._scene, self._unit, self._through = mapper.scene, unit, water_range
         self._water = mean_water(mapper.scene, mapper.views)
-        self._exposure = exposure_of_looks(mapper) if water_range is None else 1.0
+        self._tone = restored_tone(mapper) if water_range is None else ShownTone()
 
     @property
     def device(self) -> torch.device:
@@ -173,7 +178,7 @@ class Colours:
         """Colours [h, w, 3], and what share of them was restored from light [h, w] in [0, 1]."""
         sure = np.ones(nearest.shape, np.float32)
         if self._water is None:
-            return to_bytes(self._exposure * picture_out(radiance)), sure
+            return to_bytes(self._tone.of(picture_out(radiance))), sure
         seen_from = nearest if self._through is None else np.full(nearest.shape, self._through)
         z = np.where(np.isfinite(seen_from), seen_from, 0.0) / self._unit
         ranges = water_in(z, radiance.device)
@@ -183,6 +188,6 @@ class Colours:
             return to_bytes(picture_out(seen)), sure
         recovered = restored_radiance(self._scene, radiance, ranges, self._water)
         return (
-            to_bytes(self._exposure * picture_out(recovered.picture)),
+            to_bytes(self._tone.of(picture_out(recovered.picture))),
             picture_out(recovered.confidence).astype(np.float32),
         )
