@@ -161,8 +161,9 @@ def restored_tone(mapper: Mapper, views: Sequence[View] | None = None) -> ShownT
     """What all restored pictures of the map are shown in, judged by the map from some of its views,
     or from ``views``, with and without water."""
     spread = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
-    looks = [_look(mapper.scene, view, mapper.show(view)) for view in views or spread]
-    seen, clear = (np.concatenate([*each, np.zeros((0, 3))]) for each in zip(*looks, strict=True))
+    looks = [(np.zeros((0, 3)), np.zeros((0, 3)))]
+    looks += [_look(mapper.scene, view, mapper.show(view)) for view in views or spread]
+    seen, clear = (np.concatenate(each) for each in zip(*looks, strict=True))
     return tone_of(seen, clear)
 
 
@@ -184,8 +185,10 @@ def tone_of(
     """For a person to look at: at least as light on the mean as the camera saw the same pixels
     (CIELAB), as far as highlights allow, and these not cut off. Nothing is changed where that is so
     anyway."""
-    if not len(clear):
+    sound = np.isfinite(seen).all(axis=-1) & np.isfinite(clear).all(axis=-1)
+    if not sound.any():
         return ShownTone()
+    seen, clear = seen[sound], clear[sound]
     brightest = float(np.quantile(clear.max(axis=-1), BRIGHT_QUANTILE))
     wanted = float(lightness(seen).mean())
 

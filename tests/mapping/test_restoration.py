@@ -178,6 +178,8 @@ def test_a_dive_that_is_light_enough_without_water_is_shown_as_it_is() -> None:
     clear[0] = 1.9  # a single bright pixel darkens no dive
     assert tone_of(seen, clear) == ShownTone()
     assert tone_of(seen[:0], clear[:0]) == ShownTone()
+    clear[1], seen[2] = np.nan, np.inf
+    assert tone_of(seen, clear) == ShownTone()
 
 
 def test_what_is_brighter_than_white_without_water_is_drawn_together() -> None:
