@@ -59,7 +59,7 @@ class RestoredPicture:
     """[H, W] bool, False where open water was removed; None where it stays in the picture."""
     amplification: Tensor | None
     """[2, 3] RGB, mean over what was restored: as applied, and the most that the posterior allows
-    (see water/exposure.py); None where nothing was, or without a posterior."""
+    (see water/white_balance.py); None where nothing was, or without a posterior."""
 
     def picture_bytes(self, tone: ShownTone) -> npt.NDArray[np.uint8]:
         """[H, W, 3], or [H, W, 4] with alpha where open water was removed."""
@@ -76,7 +76,7 @@ class RestoredPicture:
 @torch.no_grad()
 def restored_picture(scene: Scene, view: View, shown: RenderedMap) -> RestoredPicture:
     """The picture without water, at the ranges that the map ``shown`` from the view has, in the
-    white balance that the camera had for what was nearest (see water/exposure.py).
+    white balance that the camera had for what was nearest (see water/white_balance.py).
 
     Where the vehicle is in the picture, the map's own radiance, bounded alike. J-hat keeps the
     detail that the map has lost: on synthetic dives it is 5 dB closer to the clean scene than the
@@ -157,17 +157,17 @@ class ShownTone:
 
 
 @torch.no_grad()
-def restored_tone(mapper: Mapper, views: Sequence[View] | None = None) -> ShownTone:
+def restored_tone(mapper: Mapper) -> ShownTone:
     """What all restored pictures of the map are shown in, judged by the map from some of its views,
-    or from ``views``, with and without water."""
+    with and without water."""
     spread = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
     looks = [(np.zeros((0, 3)), np.zeros((0, 3)))]
-    looks += [_look(mapper.scene, view, mapper.show(view)) for view in views or spread]
+    looks += [seen_and_clear(mapper.scene, view, mapper.show(view)) for view in spread]
     seen, clear = (np.concatenate(each) for each in zip(*looks, strict=True))
     return tone_of(seen, clear)
 
 
-def _look(scene: Scene, view: View, shown: RenderedMap) -> tuple[Array, Array]:
+def seen_and_clear(scene: Scene, view: View, shown: RenderedMap) -> tuple[Array, Array]:
     """[n, 3] colours of what is solid and was restored rather than filled in, through the water and
     without it."""
     step = max(1, round((shown.alpha.numel() / LOOK_PIXELS) ** 0.5))
@@ -230,7 +230,7 @@ def to_bytes(
 #
 # The map's radiance J was found behind its water so that pictures fit; where little light came back
 # it is as uncertain as that light. So it is put behind the water again, at the range from which it
-# was seen, and recovered as a picture is (water/exposure.py): no channel is amplified beyond
+# was seen, and recovered as a picture is (water/white_balance.py): no channel is amplified beyond
 # what its light there allows. Restored frames, PLY files, the viewer, orthos and meshes show this.
 
 

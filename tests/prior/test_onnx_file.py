@@ -10,11 +10,7 @@ import torch
 
 from aquaflow.prior.onnx_file import write_onnx
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _onnxscript() -> None:
-    """Its import takes seconds: only where a test runs, not where tests are collected."""
-    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
+pytestmark = pytest.mark.usefixtures("onnxscript")
 
 
 def failing_with(cause: BaseException) -> Any:

@@ -15,7 +15,7 @@ from aquaflow.dive.point_cloud import PointCloud, PosedView, posed_views
 from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import restored_tone, to_bytes
+from aquaflow.mapping.restoration import seen_and_clear, to_bytes, tone_of
 from aquaflow.mapping.state import MapCopy, copy_map
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -57,7 +57,7 @@ def take_map_moment(
         seen = SeenFrame(view, view.image, mapper.show(view))
         rendered = to_bytes(picture_out(seen.shown.image))
         if mapper.medium.active:
-            tone = restored_tone(mapper, [view])
+            tone = tone_of(*seen_and_clear(mapper.scene, view, seen.shown))
             restored = without_water(mapper, seen).picture_bytes(tone)[..., :3]
     water = mapper.scene.water(view)
     copy = copy_map(mapper) if points else None

@@ -225,8 +225,7 @@ class _Pictures:
     def __init__(self, source: _Source, progress: Progress | None) -> None:
         mapper = source.mapper
         self._source, self._progress, self._done = source, progress, 0
-        has_water = source.has_water
-        self._tone = tone_without_water(source.dive, mapper) if has_water else ShownTone()
+        self._tone = tone_without_water(source.dive, mapper) if source.has_water else ShownTone()
         self._seen: Iterator[SeenFrame] = seen_frames(source.dive, mapper, source.recording)
         self._next = next(self._seen, None)
 

@@ -286,13 +286,10 @@ class World:
         if len(known) < LEAST_FOR_TREND:
             return 0.0
         number, apart, sigma = np.array(known).T
-        weight = sigma**-2.0
-        place = number - np.average(number, weights=weight)
-        apart = apart - np.average(apart, weights=weight)
-        information = float((weight * place**2).sum())
-        slope = float((weight * place * apart).sum()) / max(information, 1e-12)
-        spread = float((weight * (apart - slope * place) ** 2).sum()) / (len(known) - 2)
-        return abs(slope) * float(np.sqrt(information / max(spread, 1.0)))
+        line, covariance = np.polyfit(number, apart, 1, w=1.0 / sigma, cov="unscaled")
+        left = (apart - np.polyval(line, number)) / sigma
+        spread = max(float(left @ left) / (len(known) - 2), 1.0)
+        return float(abs(line[0]) / np.sqrt(spread * covariance[0, 0]))
 
     @staticmethod
     def at(component: int, frame: WorldFrame, edges: Sequence[WorldEdge]) -> World:

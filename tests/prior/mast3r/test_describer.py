@@ -21,18 +21,12 @@ from aquaflow.prior.runtime import RuntimeSettings
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("onnxscript")]
 
 FRAME = (64, 64)
 TALL = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
 CELLS = (6, 8)
 """Rows and columns of cells that show a picture of 4 : 3 in FRAME."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _onnxscript() -> None:
-    """Its import takes seconds: only where a test runs, not where tests are collected."""
-    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
 
 
 @pytest.fixture(scope="module")

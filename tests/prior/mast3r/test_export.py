@@ -26,18 +26,12 @@ from aquaflow.prior.mast3r.export import OUTPUTS, export, parity_of, relative_di
 from aquaflow.prior.mast3r.network import TINY, Mast3r
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
-pytestmark = pytest.mark.ci
+pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("onnxscript")]
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
 
 WIDTH, HEIGHT = 48, 32
 CPU = RuntimeSettings(device="cpu")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _onnxscript() -> None:
-    """Its import takes seconds: only where a test runs, not where tests are collected."""
-    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
 
 
 def silent(stage: str, done: int, total: int) -> None:
