@@ -134,6 +134,10 @@ def _replay(
     synchronise(run, telemetry)
     run.sources = _sources(run, recording)
     notes = recording.notes + telemetry.notes
+    if run.calibration is not None and run.calibration is not recording.camera:
+        # What became of one that lies beside the pictures does not matter then.
+        unused = sources_of(recording).get("calibration")
+        notes = [note for note in notes if note != unused]
     return run.finish(notes, lambda done, total: progress("refine", done, total))
 
 

@@ -203,7 +203,7 @@ class VideoFile:
             return camera
         self._facts["calibration"] = (
             f"{file} is not used: it is for pictures of {camera.width} x {camera.height}, those of "
-            f"{self.path.name} are {stored}"
+            f"{self.path.name} are {stored}; if it is for the cropped ones, give it with --calib"
         )
         return None
 

@@ -41,16 +41,21 @@ def test_a_wrong_focal_length_is_said_first_and_ends_with_3(
     assert "the calibration does not fit the dive" in (dive / "report.html").read_text()
 
 
-def test_a_calibration_that_cannot_be_checked_is_noted(
+def test_a_given_calibration_that_cannot_be_checked_is_noted_and_no_other_is(
     small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "lens_error", lambda keyframes: None)
+    recording = open_recording(small_recording)
+    assert recording.camera is not None
+    beside = f"the calibration is {small_recording / 'camera.yaml'}"
+    assert beside in recording.notes
     finished = replay.map_recording(
-        open_recording(small_recording), "unchecked", tmp_path / "dive", TRACKING
+        recording, "unchecked", tmp_path / "dive", TRACKING, recording.camera.with_focal_scaled(1.0)
     )
     assert finished.metrics["calibration_check"] is None
     said = "whether the calibration fits could not be checked"
     assert sum(note.startswith(said) for note in finished.notes) == 1
+    assert beside not in finished.notes
 
 
 def test_the_right_calibration_is_no_warning(small_dive: Path) -> None:

@@ -170,7 +170,7 @@ def test_a_calibration_that_does_not_fit_is_named(tmp_path: Path) -> None:
     assert source.camera is None
     assert source.notes[1] == (
         f"{tmp_path / 'camera.yaml'} is not used: it is for pictures of 160 x 90, those of "
-        "clip.avi are 96 x 96"
+        "clip.avi are 96 x 96; if it is for the cropped ones, give it with --calib"
     )
 
 
