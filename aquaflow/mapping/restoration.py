@@ -85,7 +85,8 @@ def restored_picture(scene: Scene, view: View, shown: RenderedMap) -> RestoredPi
     (``medium.open_water``).
     """
     camera, solid = scene.evenly_lit(view), shown.alpha > SOLID
-    recovered, open_water = scene.recover(view, camera, shown.z), scene.open_water(view, camera)
+    recovered = scene.recover(view, camera, shown.z)
+    open_water = scene.open_water(view, camera, shown)
     usable = solid & view.scene_mask()
     image = torch.where(usable[..., None], recovered.picture, _own_colours(scene, view, shown))
     image = image + ((1.0 - shown.alpha) * ~usable)[..., None] * camera

@@ -23,7 +23,8 @@ from aquaflow.water.exposure import gain_of, learn_gain
 from aquaflow.water.medium import LearnedMedium, WaterParameters
 from aquaflow.water.model import TERMS, gain_map
 from aquaflow.water.nearest import Nearest
-from aquaflow.water.open_sightings import open_water
+from aquaflow.water.open_sightings import light_of_ground, open_water
+from aquaflow.water.sightings import SOLID
 from aquaflow.water.sunlight import Sunlight
 from aquaflow.water.white_balance import Recovered, WhiteBalance
 
@@ -244,15 +245,19 @@ class Scene:
         self,
         view: View,
         lit: Tensor,  # [H, W, 3] its picture, evenly lit
+        shown: RenderedMap,
     ) -> Tensor:
-        """[H, W] bool, True where the view's picture shows nothing but water."""
+        """[H, W] bool, True where the view's picture shows nothing but water; nowhere before the
+        first fit, which says what ground would return."""
         water = self.water(view)
-        if water is None:
+        if water is None or self.balance is None:
             return torch.zeros(lit.shape[:2], dtype=torch.bool, device=self.device)
         uneven = self.uneven(view)
         B_inf = water.B_inf.expand(lit.shape)
         B_inf = B_inf if uneven is None else B_inf * uneven[..., None]
-        found = open_water(picture_out(lit), picture_out(B_inf.contiguous()))
+        T = picture_out(water.transmission(shown.z))
+        ground = light_of_ground(np.array(self.balance.mean), T, picture_out(shown.alpha > SOLID))
+        found = open_water(picture_out(lit), picture_out(B_inf.contiguous()), ground)
         return water_in(found, self.device, torch.bool) & view.scene_mask()
 
     @torch.no_grad()

@@ -134,7 +134,8 @@ def estimating(
         assert dry is not None
         return (yield from _estimate(observations, dry, odds))
     yield
-    extended = yield from with_open_water(observations, pictures, wet.prediction.trial)
+    found = wet.prediction
+    extended = yield from with_open_water(observations, pictures, found.trial, found.J.mean(axis=1))
     if extended.points > observations.points:
         wet_models = [model for model in models if model.water]
         (wet,) = yield from fit_likeliest(problems(extended, wet_models))
@@ -154,7 +155,7 @@ def _estimate(
     if water.model.water:
         sigma = _beta_a_sigma(best)
         J = best.prediction.J[:, : seen.points]
-        nearest = yield from nearest_of(seen, pictures, trial)
+        nearest = yield from nearest_of(seen, pictures, trial, J.mean(axis=1))
         balance = white_balance(nearest, water, trial, J, sigma)
         clean = water.without_water(trial, seen.view, seen.xy, seen.z, seen.colour)
         range_variance[1] = variance_over_range(seen, clean.T)

@@ -40,13 +40,16 @@ class Nearest:
 
 
 def nearest_of(
-    seen: Observations, pictures: Sequence[PosedPicture], trial: Trial
+    seen: Observations,
+    pictures: Sequence[PosedPicture],
+    trial: Trial,
+    mean: Array,  # [3] of the scene without that water
 ) -> Generator[None, None, Nearest]:
     """In the pictures, open water left out; of the observations, where no picture shows any; with
     pauses."""
     found = []
     for number in range(min(len(pictures), len(trial.exposure))):
-        found.append(_in_picture(pictures[number], trial, number))
+        found.append(_in_picture(pictures[number], trial, mean, number))
         if number % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
             yield
     found = [near for near in found if len(near.z)] or [_of_observations(seen)]
@@ -57,11 +60,11 @@ def nearest_of(
     return Nearest(view, xy, z, colour)
 
 
-def _in_picture(picture: PosedPicture, trial: Trial, view: int) -> Nearest:
+def _in_picture(picture: PosedPicture, trial: Trial, mean: Array, view: int) -> Nearest:
     image, z = picture.half_size(), picture.surface_ranges()
     # Where open water ends there is texture in the window, but no surface yet.
     window = np.ones((2 * WINDOW_PX, 2 * WINDOW_PX), np.uint8)
-    is_open = cv2.dilate(open_area(picture, trial, view).astype(np.uint8), window) > 0
+    is_open = cv2.dilate(open_area(picture, trial, mean, view).astype(np.uint8), window) > 0
     z = np.where(is_open, np.float32(np.inf), z)
     known = np.isfinite(z)
     limit = np.quantile(z[known], SHARE) if known.any() else 0.0

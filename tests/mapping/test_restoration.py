@@ -79,6 +79,7 @@ def with_open_water(choice: str) -> tuple[Scene, View, RenderedMap]:
     """The floor, in a picture whose upper rows show open water, where the map has Gaussians."""
     scene, view = submerged()
     scene.config = scene.config.model_copy(update={"open_water": choice})
+    scene.balance = WhiteBalance(1.0, (0.4, 0.4, 0.4), (1.0, 1.0, 1.0), 0.1)
     shown = scene.show(view)
     image = view.image.copy()
     image[:24] = np.rint(255.0 * scene.medium.B_inf_logit.sigmoid().detach().numpy())
@@ -101,6 +102,12 @@ def test_open_water_is_black_unless_another_is_wished() -> None:
     assert float(restored.image[36:].mean()) > 0.1
     assert restored.opaque is None
     assert restored.picture_bytes(ShownTone()).shape == (48, 64, 3)
+
+
+def test_before_the_first_fit_no_water_is_known_to_be_open() -> None:
+    scene, view, shown = with_open_water("removed")
+    scene.balance = None
+    assert bool(restored_picture(scene, view, shown).opaque.all())
 
 
 def test_open_water_begins_softly() -> None:
@@ -134,7 +141,6 @@ def test_clear_water_has_no_open_water() -> None:
 @pytest.mark.parametrize("choice", ["kept", "removed", "black"])
 def test_what_was_not_restored_from_the_picture_has_no_confidence(choice: str) -> None:
     scene, view, shown = with_open_water(choice)
-    scene.balance = WhiteBalance(1.0, (0.4, 0.4, 0.4), (0.8, 0.9, 1.0), 0.1)
     mask = np.ones((48, 64), bool)
     mask[20:30] = False
     view.mask = mask

@@ -20,6 +20,7 @@ from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sig
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=80.0, cy=60.0)
 NOTHING = np.zeros(5)
+MEAN = np.array([0.4, 0.5, 0.3])
 
 
 def trial(views: int) -> Trial:
@@ -40,7 +41,7 @@ def picture(
 
 def test_each_open_cell_is_an_observation_at_infinity() -> None:
     seen = sighted(points=120)
-    extended = run_to_end(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
+    extended = run_to_end(with_open_water(seen, [picture(B_INF)] * 2, trial(2), MEAN))
     rows = slice(len(seen.z), None)
     open_rows = COLUMNS * (ROWS // 2 - 1)  # the cells that touch the floor are not all open
     assert 2 * open_rows <= extended.points - seen.points <= 2 * COLUMNS * ROWS // 2
@@ -56,7 +57,7 @@ def test_each_open_cell_is_an_observation_at_infinity() -> None:
 
 def test_observations_of_one_views_open_water_share_their_errors() -> None:
     seen = sighted(points=120)
-    extended = run_to_end(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
+    extended = run_to_end(with_open_water(seen, [picture(B_INF)] * 2, trial(2), MEAN))
     shared = extended.errors_shared[len(seen.z) :]
     assert len(set(shared.tolist())) == 2
     assert min(shared) > max(extended.errors_shared[: len(seen.z)])
@@ -64,15 +65,16 @@ def test_observations_of_one_views_open_water_share_their_errors() -> None:
 
 def test_pictures_without_open_water_add_nothing() -> None:
     seen = sighted(points=120)
-    assert run_to_end(with_open_water(seen, [picture(np.array([0.9, 0.8, 0.1]))], trial(1))) is seen
-    assert run_to_end(with_open_water(seen, [], trial(1))) is seen
+    red = picture(np.array([0.9, 0.8, 0.1]))
+    assert run_to_end(with_open_water(seen, [red], trial(1), MEAN)) is seen
+    assert run_to_end(with_open_water(seen, [], trial(1), MEAN)) is seen
 
 
 def test_a_masked_vehicle_is_no_open_water() -> None:
     seen = sighted(points=120)
     mask = np.ones((120, 160), bool)
     mask[:60] = False
-    assert run_to_end(with_open_water(seen, [picture(B_INF, mask)], trial(1))) is seen
+    assert run_to_end(with_open_water(seen, [picture(B_INF, mask)], trial(1), MEAN)) is seen
 
 
 def test_open_water_pins_what_the_surface_leaves_open() -> None:

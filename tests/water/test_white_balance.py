@@ -170,7 +170,7 @@ def test_the_nearest_tenth_of_the_surface_is_kept_and_open_water_is_no_surface()
     view = View(0, image, CAMERA, Sim3(np.eye(3), np.zeros(3)), 0, robust=False)
     picture = PosedPicture(view, torch.from_numpy(z), torch.ones(120, 160))
     trial = Trial(BETA, B, B_INF, np.zeros(5), np.zeros(5), np.zeros((1, 3)))
-    near = run_to_end(nearest_of(sighted(points=120), [picture], trial))
+    near = run_to_end(nearest_of(sighted(points=120), [picture], trial, np.full(3, 0.4)))
     assert near.z.min() == pytest.approx(1.0, abs=0.02)
     assert near.z.max() < 1.2
     assert near.xy[:, 1].min() > 0.8
@@ -180,7 +180,7 @@ def test_the_nearest_tenth_of_the_surface_is_kept_and_open_water_is_no_surface()
 def test_without_pictures_the_nearest_observations_of_each_view_are_kept() -> None:
     seen = sighted(points=200)
     trial = Trial(BETA, B, B_INF, np.zeros(5), np.zeros(5), np.zeros((4, 3)))
-    near = run_to_end(nearest_of(seen, [], trial))
+    near = run_to_end(nearest_of(seen, [], trial, np.full(3, 0.4)))
     for view in range(4):
         share = (near.view == view).sum() / (seen.view == view).sum()
         assert share == pytest.approx(0.1, abs=0.02)
