@@ -53,7 +53,7 @@ def synth(
     """Write a synthetic dive with its ground truth."""
     from pydantic import ValidationError
 
-    from aquaflow.base.errors import ConfigError
+    from aquaflow.base.errors import ConfigError, words_of
     from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 
     asked = {
@@ -64,7 +64,7 @@ def synth(
         config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})
     except ValidationError as error:
         first = error.errors()[0]
-        raise ConfigError(f"--{first['loc'][0]}: {first['msg'].lower()}") from error
+        raise ConfigError(f"--{first['loc'][0]}: {words_of(first['msg'])}") from error
     with progress_bars(quiet=as_json) as progress:
         write_dive(out, config, lambda done, total: progress("render", done, total))
     if as_json:

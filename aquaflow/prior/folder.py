@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from aquaflow.base.errors import InputError, path_of_key
+from aquaflow.base.errors import InputError, path_of_key, words_of
 from aquaflow.config.stage import StageConfig
 from aquaflow.prior.contract import RangeUnit
 
@@ -126,7 +126,7 @@ def read_card(folder: Path) -> PriorCard:
         first = error.errors()[0]
         where = path_of_key(first["loc"]) or "the file"
         raise InputError(
-            f"{path}: {where} {first['msg'].lower()}; export the prior again"
+            f"{path}: {where} {words_of(first['msg'])}; export the prior again"
         ) from error
     for name, expected in card.files.items():
         if Path(name).name != name:

@@ -123,6 +123,13 @@ def test_a_synthetic_dive_that_does_not_exist_is_refused(
     refused(aquaflow("lab", "synth", tmp_path / "s", f"--{option}", value), f"--{option}")
 
 
+def test_values_that_are_offered_can_be_given_as_they_are_offered(
+    aquaflow: Cli, tmp_path: Path
+) -> None:
+    said = aquaflow("lab", "synth", tmp_path / "s", "--water", "milk")
+    refused(said, "'coastal_1C'", "'oceanic_IB'")
+
+
 # --- folders to write to and to read from ---------------------------------------------------------
 
 

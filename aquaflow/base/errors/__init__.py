@@ -164,10 +164,10 @@ def printable_text(text: str) -> str:
 
 
 def words_of(message: str) -> str:
-    """pydantic's message on a key, as words that follow the key's name; those of our own
-    validators may hold names, whose case is kept."""
+    """pydantic's message on a key, as words that follow the key's name; names and values in it keep
+    their case."""
     own = message.removeprefix("Value error, ")
-    return message.lower() if own == message else own
+    return message[:1].lower() + message[1:] if own == message else own
 
 
 def path_of_key(parts: Iterable[object]) -> str:
