@@ -17,6 +17,8 @@ from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
@@ -359,11 +361,11 @@ def scale_drift(graph: Snapshot, keyframes: Sequence[Keyframe]) -> ScaleDrift | 
     links = graph.edges[~graph.edges["loop"]]
     if not len(links):
         return None
-    drift, root = -np.log(graph.nodes["scale"]), np.arange(len(graph.nodes))
-    for a, b in zip(links["a"].tolist(), links["b"].tolist(), strict=True):
-        root[max(a, b)] = root[min(a, b)]
+    drift, count = -np.log(graph.nodes["scale"]), len(graph.nodes)
+    linked = coo_array((np.ones(len(links)), (links["a"], links["b"])), (count, count))
+    chains, chain_of = connected_components(linked, directed=False)
     largest = max(
-        (np.flatnonzero(root == each) for each in np.unique(root)),
+        (np.flatnonzero(chain_of == chain) for chain in range(chains)),
         key=lambda rows: float(np.ptp(drift[rows])),
     )
     ends = sorted((largest[np.argmin(drift[largest])], largest[np.argmax(drift[largest])]))

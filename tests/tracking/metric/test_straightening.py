@@ -152,6 +152,18 @@ def test_the_place_of_a_joined_sub_map_is_no_drift() -> None:
     assert found.ratio == pytest.approx(1.0)
 
 
+def test_a_drift_is_told_whatever_the_order_in_which_its_links_were_found() -> None:
+    graph = PoseGraph()
+    for k in range(4):
+        graph.add_keyframe(k, Sim3(np.eye(3), np.array([0.5 * k, 0.0, 0.0]), 1.0 - 0.1 * k))
+    for k in (3, 2, 1):
+        assert graph.add_edge(Edge(k - 1, k, graph.pose(k - 1).inverse() @ graph.pose(k), LINK))
+    found = scale_drift(graph.snapshot(), [keyframe_of(k, k) for k in range(4)])
+    assert found is not None
+    assert (found.first, found.last) == (0, 3)
+    assert found.ratio == pytest.approx(1.0 / 0.7)
+
+
 def test_without_a_world_nothing_of_the_graph_changes() -> None:
     graph = drifted(way())
     before = poses_of(graph.snapshot().nodes)
