@@ -5,6 +5,7 @@ its white balance is the camera's, set for a scene in water, times what the fit 
 between, and an error in the attenuation becomes a cast of colour. So what is shown is J under one
 gain per channel, by which what was seen nearest has on the mean the colour that the camera saw,
 backscatter included: what is nearest keeps its colours, and what is further away gets the same.
+Where another white balance is chosen, another gain comes on top (illuminant.py).
 
 What returns little light is amplified, its noise and the water's own uncertainty with it. A picture
 is therefore the mean of what J may be (a linear minimum mean square error estimate): where light is
@@ -33,6 +34,7 @@ whatever the pixel is: less light is amplified more only until it drowns in the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -50,6 +52,16 @@ GREY = 0.9
 """Correlation of a scene's channels: 0.85 to 0.97 on the same clips' nearest quarter."""
 
 
+LEAST_LIGHT = 1e-6
+"""Share of full scale: guards the division where no light comes back."""
+
+Rgb = tuple[float, float, float]
+CAMERA: Literal["camera"] = "camera"
+NEUTRAL: Literal["neutral"] = "neutral"
+"""Names of white balances: that of the camera for what was nearest, and that in which the light of
+the restored scene is grey."""
+
+
 @dataclass(frozen=True)
 class Recovered:
     """A picture without its water, and how far it can be relied on."""
@@ -65,6 +77,18 @@ class Recovered:
 
 
 @dataclass(frozen=True)
+class ChosenWhite:
+    """A white balance that was asked for, on top of the camera's."""
+
+    name: str = CAMERA
+    """``camera``, ``neutral`` or the ``FRAME:X,Y`` that was said to be grey."""
+    gain: Rgb = (1.0, 1.0, 1.0)
+    """RGB; the scene's mean luminance stays."""
+    sigma: Rgb | None = None
+    """Relative deviation of ``gain``; None: the camera's, which is what it is."""
+
+
+@dataclass(frozen=True)
 class WhiteBalance:
     """What restored pictures are shown in."""
 
@@ -76,6 +100,14 @@ class WhiteBalance:
     """Of J, RGB: by it what was seen nearest keeps the mean colour that the camera saw."""
     attenuation_sigma: float
     """Relative deviation of the attenuation, mean of RGB."""
+    chosen: ChosenWhite = ChosenWhite()
+    """What comes on top of ``gain``."""
+
+    @property
+    def white(self) -> Rgb:
+        """Gain of J that is shown, RGB."""
+        red, green, blue = (a * b for a, b in zip(self.gain, self.chosen.gain, strict=True))
+        return red, green, blue
 
     def recover(
         self,
@@ -87,7 +119,7 @@ class WhiteBalance:
         """The balanced picture without water; the module's text derives it."""
         T, veil = water.transmission(z), water.backscatter(z)
         veil = veil if uneven is None else veil * uneven[..., None]
-        mean, white = (water_in(each, z.device) for each in (self.mean, self.gain))
+        mean, white = (water_in(each, z.device) for each in (self.mean, self.white))
         depth = water.beta_a * (z[..., None] - self.near_range).clamp_min(0.0)
         noise = PICTURE_NOISE**2 + (VEIL_ERROR * veil).square()
         noise = noise + (self.attenuation_sigma * depth * mean * T).square()
@@ -103,3 +135,16 @@ class WhiteBalance:
             own * white,
             torch.minimum(1.0 / T, deviation / (2.0 * noise.sqrt())) * white,
         )
+
+    def noise_of_light(
+        self,
+        water: WaterParameters,
+        z: float,  # range, map units
+        pixels: int = 1,  # that are averaged over
+    ) -> Tensor:
+        """[3] relative deviation of the light of a channel that comes back from the scene's mean
+        colour at the range."""
+        at = water_in([z], water.beta_a.device)
+        light = water.transmission(at)[0] * water_in(self.mean, at.device)
+        veil = VEIL_ERROR * water.backscatter(at)[0]
+        return (PICTURE_NOISE**2 / pixels + veil.square()).sqrt() / light.clamp_min(LEAST_LIGHT)
