@@ -72,6 +72,11 @@ class MediumConfig(StageConfig):
         description="what open water is in restored pictures: as the camera saw it, transparent, "
         "or black",
     )
+    white_balance: Literal["camera", "neutral"] = Field(
+        "camera",
+        description="of restored pictures: as the camera saw what was nearest, or with the light "
+        "of the scene made grey; exports of a dive can have another",
+    )
     initial_attenuation: Lab[float] = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"
     )

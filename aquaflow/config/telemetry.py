@@ -310,7 +310,7 @@ class FusionConfig(StageConfig):
         0.001, ge=0, le=0.1, description="relative, 1 sigma of a DVL's long-term accuracy: Water "
         "Linked A50 Performance 0.1 %, Standard 1 %; speed of sound for a wrong salinity adds 1 %"
     )  # fmt: skip
-    position_lag_sigma_s: float = Field(
+    position_lag_sigma_s: Lab[float] = Field(
         0.3, ge=0, description="s, 1 sigma of how much older a position fix is than it states"
     )
     depth_change_sigma_m: Lab[float] = Field(

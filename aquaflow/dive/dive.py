@@ -65,6 +65,8 @@ class Dive:
         assert not unknown, f"a Dive has no {unknown}"
         vars(self).update(known)
         self._maps: dict[int, Mapper] = {}
+        self.white_balance: str | None = None
+        """Of restored colours, where one was chosen anew (aquaflow/dive/white_balance.py)."""
 
     def __len__(self) -> int:
         """Number of frames, posed or not."""

@@ -11,15 +11,15 @@ import torch
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.held_out_example import Fidelity, HeldOut
+from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import (
     RestoredPicture,
-    ShownTone,
     restored_picture,
-    restored_tone,
     to_bytes,
 )
 from aquaflow.mapping.scene import RenderedMap
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
@@ -41,7 +41,7 @@ def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) ->
     contain, tone = slam.failures.contain, ShownTone()
     views, as_tracked = _register_views(slam, mapper, views, until or Deadline())
     with contain("restored tone"):
-        tone = restored_tone(mapper)
+        tone = shown_tone(mapper)
     examined = []
     for view in views:
         with contain("evaluation", view.frame_index):

@@ -19,8 +19,9 @@ from aquaflow.base.errors import AquaFlowError, DamagedError, InputError, reason
 from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.dive.results import WaterSummary
+from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import restored_gaussians, restored_tone
+from aquaflow.mapping.restoration import restored_gaussians
 from aquaflow.mapping.state import deserialise, serialise
 from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.transfers import map_out, picture_out, water_in, water_out
@@ -28,6 +29,7 @@ from aquaflow.render.views import View
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.medium import WaterParameters
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.white_balance import CAMERA
 
 SUFFIX = ".aqf"
 """Of a map file."""
@@ -101,30 +103,50 @@ def write_splats(
     """map.ply and map_clear.ply, as :meth:`aquaflow.dive.folder.DiveFolder.write_splats` says."""
     with torch.no_grad():
         plain = mapper.scene.bake_parameters(mapper.views)
-        clear = radiance(plain["raw_colours"])
-        seen = clear
+        J = radiance(plain["raw_colours"])
+        seen = clear = map_out(J)
         if water is not None:
-            medium = water_of(water, clear.device)
-            z = torch.full((len(clear),), water.range_median, device=clear.device)
-            seen = clear * medium.transmission(z) + medium.backscatter(z)
-            clear = restored_gaussians(mapper.scene, clear, mapper.views)
+            medium = water_of(water, J.device)
+            z = torch.full((len(J),), water.range_median, device=J.device)
+            seen = map_out(J * medium.transmission(z) + medium.backscatter(z))
+            clear = _as_shown(mapper, J)
         for name, colours in (("map", seen), ("map_clear", clear)):
-            splats = _splats(plain, colours)
-            if not frame.is_identity:
-                splats = splats.transform(frame.T_nm)
-            write_ply(folder / f"{name}{suffix}.ply", splats)
+            write_ply(folder / f"{name}{suffix}.ply", _placed(_splats(plain, colours), frame))
+
+
+def clear_splats(mapper: Mapper, frame: WorldFrame) -> PlyGaussians:
+    """All Gaussians in ``frame``, without water, in the colours that are shown of the map."""
+    with torch.no_grad():
+        plain = mapper.scene.bake_parameters(mapper.views)
+        colours = _as_shown(mapper, radiance(plain["raw_colours"]))
+    return _placed(_splats(plain, colours), frame)
+
+
+def _placed(splats: PlyGaussians, frame: WorldFrame) -> PlyGaussians:
+    return splats if frame.is_identity else splats.transform(frame.T_nm)
+
+
+@torch.no_grad()
+def _as_shown(
+    mapper: Mapper,
+    J: torch.Tensor,  # [N, 3] of the Gaussians
+) -> npt.NDArray[np.float32]:
+    """[N, 3] without water, in the white balance and tone of the map."""
+    tone = shown_tone(mapper)
+    clear = restored_gaussians(mapper.scene, J, mapper.views)
+    return tone.of(map_out(clear)).astype(np.float32)
 
 
 def _splats(
     parameters: Mapping[str, torch.Tensor],  # of a GaussianMap
-    colours: torch.Tensor,  # [N, 3]
+    colours: npt.NDArray[np.float32],  # [N, 3]
 ) -> PlyGaussians:
     return PlyGaussians(
         map_out(parameters["means"]),
         map_out(torch.nn.functional.normalize(parameters["quats"], dim=-1)),
         map_out(torch.exp(parameters["log_scales"])),
         map_out(torch.sigmoid(parameters["opacity_logits"][:, 0])),
-        map_out(colours),
+        colours,
     )
 
 
@@ -168,7 +190,7 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
     if len(z) == 0:
         return None
     low, high = np.percentile(picture_out(z), RANGE_PERCENTILES)
-    first, tone = waters[0], restored_tone(mapper)
+    first, tone, balance = waters[0], shown_tone(mapper), mapper.scene.balance
     summary = WaterSummary(
         water_out(torch.stack([water.beta_a for water in waters]).mean(0)).tolist(),
         water_out(first.b).tolist(),
@@ -179,7 +201,10 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
         float(z.median()),
         float(high),
         water_out(mapper.scene.white_gain()).tolist(),
-        None if mapper.scene.balance is None else mapper.scene.balance.near_range,
+        CAMERA if balance is None else balance.chosen.name,
+        [1.0] * 3 if balance is None else list(balance.chosen.gain),
+        None if balance is None or balance.chosen.sigma is None else list(balance.chosen.sigma),
+        None if balance is None else balance.near_range,
         mapper.scene.range_variance,
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.map_file import clear_splats
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.ply import PlyGaussians, read_ply
 from aquaflow.geometry.camera import CameraModel
@@ -130,6 +131,8 @@ def read_splats(dive: Dive, placement: Placement, water: bool) -> PlyGaussians:
     Raises:
         InputError: the dive has no such map, or an empty one.
     """
+    if not water and dive.white_balance is not None:
+        return clear_splats(dive.filled_map(), dive.frame).transform(placement.T_un)
     path = dive.file("map.ply" if water else "map_clear.ply")
     splats = read_ply(path)
     if not len(splats.means):

@@ -16,15 +16,15 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.png import write_png
 from aquaflow.dive.point_cloud import PointCloud, PosedView, read_posed_views, read_splats
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import (
     RestoredPicture,
-    ShownTone,
     drawn_without_water,
     restored_picture,
-    restored_tone,
 )
 from aquaflow.mapping.scene import RenderedMap
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.views import View, in_time
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
@@ -65,11 +65,16 @@ def tone_without_water(dive: Dive, mapper: Mapper) -> ShownTone:
     Raises:
         InputError: there is no water in the map.
     """
+    refuse_without_water(dive, mapper)
+    return shown_tone(mapper)
+
+
+def refuse_without_water(dive: Dive, mapper: Mapper) -> None:
+    """Raises InputError where ``mapper``, the map of ``dive``, has no water."""
     if not mapper.medium.active:
         raise InputError(
             f"{dive} has no water to remove: it was found clear, or mapping.medium.enabled was off"
         )
-    return restored_tone(mapper)
 
 
 @dataclass(frozen=True)
@@ -129,6 +134,35 @@ def _with_picture(
     )  # fmt: skip
     whole.log_gain, whole.light = view.log_gain, view.light
     return whole
+
+
+def view_of_frame(mapper: Mapper, frame: int, dive: Dive) -> View:
+    """The view of a frame.
+
+    Raises:
+        InputError: the frame was not mapped.
+    """
+    views = {view.frame_index: view for view in mapper.views}
+    if frame not in views:
+        nearest = min(views, key=lambda index: abs(index - frame), default=None)
+        other = "" if nearest is None else f"; the nearest mapped one is {nearest}"
+        raise InputError(f"frame {frame} of {dive} was not mapped{other}")
+    return views[frame]
+
+
+def refuse_outside(
+    view: View,
+    pixels: npt.NDArray[np.float64],  # [N, 2] px
+) -> None:
+    """Raises InputError for pixels that the mapped picture does not have."""
+    size = np.array([view.camera.width, view.camera.height])
+    for pixel in pixels:
+        if not bool(np.all((pixel >= 0.0) & (pixel < size))):
+            raise InputError(
+                f"the point {pixel[0]:g},{pixel[1]:g} is outside of the mapped picture of "
+                f"{size[0]} x {size[1]} pixels; give pixels of the pictures that `aquaflow export "
+                "--format restored` writes"
+            )
 
 
 # --------------------------------------------------------------------------------------------------

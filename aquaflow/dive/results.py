@@ -46,7 +46,13 @@ class WaterSummary:
     range_median: float
     range_p95: float
     white_gain: list[float]
-    """Of the clean radiance in restored pictures and map_clear.ply."""
+    """Of the clean radiance in restored pictures and map_clear.ply, in all."""
+    white_choice: str
+    """``camera``, ``neutral``, or the ``FRAME:X,Y`` that is grey."""
+    chosen_gain: list[float]
+    """What of ``white_gain`` comes on top of the camera's white balance."""
+    chosen_gain_sigma: list[float] | None
+    """Its relative standard deviation; None for the camera's."""
     near_range: float | None
     """Range whose colours restored pictures keep; None if there was no fit."""
     range_variance: tuple[float, float] | None
@@ -58,7 +64,7 @@ class WaterSummary:
     unevenness: list[float]
     """Log-gain of the backscatter over the picture, in the same terms."""
     exposure: float
-    """One gain of all restored pictures and orthos, on top of ``white_gain``."""
+    """One gain of all that is restored, on top of ``white_gain``."""
     highlight_compression: float
     """Of their highlights, see :class:`aquaflow.mapping.restoration.ShownTone`."""
 
@@ -185,7 +191,11 @@ def medium_json(
             "gain": water.white_gain,
             "exposure": water.exposure,
             "highlight_compression": water.highlight_compression,
-            "white_balance": "as the camera saw what was at near_range",
+            "white_balance": {
+                "choice": water.white_choice,
+                "gain": water.chosen_gain,
+                "sigma": water.chosen_gain_sigma,
+            },
             "near_range": water.near_range,
             "amplification": amplification
             and dict(zip(("applied", "allowed"), amplification, strict=True)),

@@ -38,6 +38,7 @@ from aquaflow.mapping.optimisation import (
 )
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.mapping.scene_water import WaterFitting, rebalance
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.contract import Renderer
 from aquaflow.render.gsplat import give_back_after
 from aquaflow.render.views import View, in_time
@@ -71,6 +72,8 @@ class Mapper:
         self._random = torch.Generator().manual_seed(seed)
         self.scene = Scene(config.medium, renderer, self._random, config.sunlight)
         self.views: list[View] = []
+        self.tone: tuple[int, ShownTone] | None = None
+        """Of restored pictures, and at how many steps it was judged (appearance.py)."""
         self._failed_in_a_row = 0
         """Steps that raised, since the last one that did not."""
         if config.decoder.enabled:

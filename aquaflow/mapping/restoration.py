@@ -4,46 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.optimize import brentq
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.mapping.scene import RenderedMap, Scene, orientations
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.transfers import map_out, picture_out, water_in
-from aquaflow.render.views import View, in_time
+from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID
 from aquaflow.water.medium import MIN_TRANSMISSION, WaterParameters
 from aquaflow.water.sightings import SOLID
 from aquaflow.water.white_balance import Recovered
 
-if TYPE_CHECKING:
-    from aquaflow.mapping.mapper import Mapper
-
-Array = npt.NDArray[np.float64]
-
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""
-BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
-"""This share of the restored pixels is shown no brighter than this level."""
-KNEE = 0.8
-"""Shown value above which highlights are drawn together, if they have to be. Held-out views of IUI3
-against their owners' restoration: 25.0 dB with 0.8, 24.8 with 0.6."""
-MOST_EXPOSURE, MOST_PEAK = 8.0, 1.25
-"""Three stops; and how far beyond white an exposure may take highlights, which are drawn together
-then: of IUI3's sand hardly any texture was left at 1.4."""
-LOOKS = 20
-"""Views, spread over the dive, that the common tone is judged by."""
 RESTORED = 0.5
 """Confidence above which a pixel's colour is more the picture's than the scene's mean: open water
 and what is lost in it say nothing of how light a scene is."""
-LOOK_PIXELS = 4000
-"""Of each of them, on a grid: mean lightness to a tenth of a unit."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +58,7 @@ class RestoredPicture:
 @torch.no_grad()
 def restored_picture(scene: Scene, view: View, shown: RenderedMap) -> RestoredPicture:
     """The picture without water, at the ranges that the map ``shown`` from the view has, in the
-    white balance that the camera had for what was nearest (see water/white_balance.py).
+    white balance that was chosen (see water/white_balance.py).
 
     Where the vehicle is in the picture, the map's own radiance, bounded alike. J-hat keeps the
     detail that the map has lost: on synthetic dives it is 5 dB closer to the clean scene than the
@@ -129,94 +111,13 @@ def _own_colours(scene: Scene, view: View, shown: RenderedMap) -> Tensor:
     if scene.water(view) is None:
         return shown.radiance
     alpha = shown.alpha.clamp_min(MIN_SOLID)[..., None]
-    return _restored_own(scene, view, shown).picture * alpha
+    return restored_own(scene, view, shown).picture * alpha
 
 
-def _restored_own(scene: Scene, view: View, shown: RenderedMap) -> Recovered:
+def restored_own(scene: Scene, view: View, shown: RenderedMap) -> Recovered:
     """The map's radiance without the view's water, and how far it can be relied on."""
     alpha = shown.alpha.clamp_min(MIN_SOLID)[..., None]
     return restored_radiance(scene, shown.radiance / alpha, shown.z, scene.water(view))
-
-
-@dataclass(frozen=True)
-class ShownTone:
-    """How the clean radiance becomes what a person looks at: one gain, and highlights that would be
-    cut off drawn together, smoothly from ``KNEE`` on."""
-
-    exposure: float = 1.0
-    compression: float = 0.0
-    """c of shown = KNEE + x / (1 + c x) for x, a value times ``exposure``, less KNEE; above it."""
-
-    def of(
-        self,
-        colours: npt.NDArray[np.floating],  # [...] of the clean radiance
-    ) -> npt.NDArray[np.floating]:
-        """[...] as shown, mostly in [0, 1]."""
-        bright = self.exposure * colours
-        above = np.maximum(bright - KNEE, 0.0)
-        return np.asarray(np.minimum(bright, KNEE) + above / (1.0 + self.compression * above))
-
-
-@torch.no_grad()
-def restored_tone(mapper: Mapper) -> ShownTone:
-    """What all restored pictures of the map are shown in, judged by the map from some of its views,
-    with and without water."""
-    spread = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
-    looks = [(np.zeros((0, 3)), np.zeros((0, 3)))]
-    looks += [seen_and_clear(mapper.scene, view, mapper.show(view)) for view in spread]
-    seen, clear = (np.concatenate(each) for each in zip(*looks, strict=True))
-    return tone_of(seen, clear)
-
-
-def seen_and_clear(scene: Scene, view: View, shown: RenderedMap) -> tuple[Array, Array]:
-    """[n, 3] colours of what is solid and was restored rather than filled in, through the water and
-    without it."""
-    step = max(1, round((shown.alpha.numel() / LOOK_PIXELS) ** 0.5))
-    grid = (slice(step // 2, None, step), slice(step // 2, None, step))
-    own = _restored_own(scene, view, shown)
-    judged = ((shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED))[grid]
-    seen, clear = shown.image[grid][judged], own.picture[grid][judged]
-    return picture_out(seen).astype(np.float64), picture_out(clear).astype(np.float64)
-
-
-def tone_of(
-    seen: Array,  # [n, 3] RGB as the camera saw it
-    clear: Array,  # [n, 3] the same without water
-) -> ShownTone:
-    """For a person to look at: at least as light on the mean as the camera saw the same pixels
-    (CIELAB), as far as highlights allow, and these not cut off. Nothing is changed where that is so
-    anyway."""
-    sound = np.isfinite(seen).all(axis=-1) & np.isfinite(clear).all(axis=-1)
-    if not sound.any():
-        return ShownTone()
-    seen, clear = seen[sound], clear[sound]
-    brightest = float(np.quantile(clear.max(axis=-1), BRIGHT_QUANTILE))
-    wanted = float(lightness(seen).mean())
-
-    def tone(exposure: float) -> ShownTone:
-        peak = exposure * brightest
-        if peak <= BRIGHT_LEVEL:
-            return ShownTone(exposure)
-        return ShownTone(exposure, 1.0 / (BRIGHT_LEVEL - KNEE) - 1.0 / (peak - KNEE))
-
-    def darker(exposure: float) -> float:
-        return wanted - float(lightness(tone(exposure).of(clear)).mean())
-
-    if darker(1.0) <= 0.0:
-        return tone(1.0)
-    most = float(np.clip(MOST_PEAK / max(brightest, 1e-6), 1.0, MOST_EXPOSURE))
-    if darker(most) >= 0.0:
-        return tone(most)
-    return tone(float(brentq(darker, 1.0, most, xtol=1e-3)))
-
-
-def lightness(
-    colours: npt.NDArray[np.floating],  # [..., 3] RGB from 0 to 1, as on a screen (sRGB)
-) -> Array:
-    """[...] L* of CIELAB, from 0 to 100."""
-    flat = np.clip(colours, 0.0, 1.0).astype(np.float32).reshape(1, -1, 3)
-    L = np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2LAB)[0, :, 0], np.float64)
-    return L.reshape(colours.shape[:-1])
 
 
 def to_bytes(
@@ -242,7 +143,7 @@ def restored_radiance(
     z: Tensor,  # [...] range from which it was seen, map units
     water: WaterParameters | None,
 ) -> Recovered:
-    """J as it is shown without ``water``, in the white balance of what is nearest; all of it where
+    """J as it is shown without ``water``, in the white balance that was chosen; all of it where
     there is no water."""
     if water is None:
         return Recovered(radiance, torch.ones_like(z))
@@ -270,11 +171,21 @@ def restored_gaussians(
     views: Sequence[View],
 ) -> Tensor:
     """[N, 3] colours of the Gaussians without water, each as the nearest of ``views`` saw it."""
+    return seen_and_restored(scene, radiance, views)[1].picture
+
+
+@torch.no_grad()
+def seen_and_restored(
+    scene: Scene,
+    radiance: Tensor,  # [N, 3] of the Gaussians
+    views: Sequence[View],
+) -> tuple[Tensor, Recovered]:
+    """[N, 3] colours of the Gaussians as the nearest of ``views`` saw each, and without water."""
     water = mean_water(scene, views)
     if water is None:
-        return radiance
+        return radiance, Recovered(radiance, torch.ones_like(radiance[:, 0]))
     centres = np.stack([view.T_wc.t for view in views])
     nearest = KDTree(centres).query(map_out(scene.gaussians.means))[0]
-    return restored_radiance(
-        scene, radiance, water_in(np.asarray(nearest), radiance.device), water
-    ).picture
+    z = water_in(np.asarray(nearest), radiance.device)
+    seen = radiance * water.transmission(z) + water.backscatter(z)
+    return seen, restored_radiance(scene, radiance, z, water)

@@ -228,7 +228,7 @@ class Scene:
         lit: Tensor,  # [H, W, 3] its picture, evenly lit
         z: Tensor,  # [H, W] range
     ) -> Recovered:
-        """The view's picture without water, in the white balance of what is nearest.
+        """The view's picture without water, in the white balance that was chosen.
 
         Before the first fit there is no posterior: a pixel is believed wholly or not at all.
         """
@@ -265,15 +265,15 @@ class Scene:
         self,
         radiance: Tensor,  # [..., 3] J
     ) -> Tensor:
-        """[..., 3] J in the white balance of what is nearest."""
+        """[..., 3] J in the white balance that was chosen."""
         return radiance * self.white_gain()
 
     @torch.no_grad()
     def white_gain(self) -> Tensor:
-        """[3] of J, by which it has the white balance of what is nearest."""
+        """[3] of J, by which it has the white balance that was chosen."""
         if not self.medium.active or self.balance is None:
             return torch.ones(3, device=self.device)
-        return water_in(self.balance.gain, self.device)
+        return water_in(self.balance.white, self.device)
 
 
 def orientations(views: Sequence[View], device: torch.device) -> Tensor:

@@ -26,6 +26,7 @@ from aquaflow.water.model import shading_basis
 from aquaflow.water.nearest import kept_by
 from aquaflow.water.observations import run_to_end
 from aquaflow.water.sightings import PosedPicture, sighting
+from aquaflow.water.white_balance import WhiteBalance
 
 
 @torch.no_grad()
@@ -124,7 +125,7 @@ def _adopt(
         scene.centre_water(fitted)
     scene.shading, scene.exposes = estimate.shading, estimate.model.exposure
     scene.beta_a_sigma, scene.water_evidence = estimate.beta_a_sigma, estimate.evidence
-    scene.balance, scene.range_variance = estimate.balance, estimate.range_variance
+    scene.balance, scene.range_variance = _as_chosen(scene, estimate), estimate.range_variance
     if estimate.nearest is not None:
         scene.seen_nearest = estimate.nearest, list(fitted)
     scene.gain_maps.clear()
@@ -140,6 +141,14 @@ def _adopt(
     raw = scene.gaussians.parameters["raw_colours"]
     # A decoder's residuals come on top again.
     raw.copy_(wanted if scene.neural is None else wanted + (raw - shown))
+
+
+def _as_chosen(scene: Scene, estimate: WaterEstimate) -> WhiteBalance | None:
+    """The estimate's white balance, with what was chosen on top of the one before: a cast over what
+    is nearest hardly changes with the water."""
+    if estimate.balance is None or scene.balance is None:
+        return estimate.balance
+    return replace(estimate.balance, chosen=scene.balance.chosen)
 
 
 def _water_of(

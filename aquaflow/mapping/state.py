@@ -33,14 +33,16 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural.neural import NeuralGaussians
-from aquaflow.mapping.restoration import restored_gaussians
+from aquaflow.mapping.restoration import RESTORED, seen_and_restored
+from aquaflow.mapping.tone import ShownTone, tone_of
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.dense_adam import STEP, DenseAdam
 from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
 from aquaflow.water.exposure import log_gains_of, set_log_gain
-from aquaflow.water.white_balance import WhiteBalance
+from aquaflow.water.sightings import SOLID
+from aquaflow.water.white_balance import ChosenWhite, WhiteBalance
 
 Facts = dict[str, Any]
 
@@ -60,7 +62,8 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "sunlight_plays": scene.sunlight.plays,
         "water_evidence": scene.water_evidence,
         "beta_a_sigma": scene.beta_a_sigma,
-        "white_balance": None if scene.balance is None else asdict(scene.balance),
+        **_white_facts(scene.balance),
+        "tone": None if mapper.tone is None else [mapper.tone[0], asdict(mapper.tone[1])],
         "range_variance": scene.range_variance,
         "decoder": mapper.neural is not None,
         "optimiser": optimiser,
@@ -81,6 +84,14 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         facts["rates"] |= {name: each.rates[0] for name, each in _dense(mapper).items()}
         arrays |= _optimisers(mapper)
     return facts, arrays
+
+
+def _white_facts(balance: WhiteBalance | None) -> Facts:
+    """The camera's white balance as any AquaFlow reads it, and what was chosen on top."""
+    if balance is None:
+        return {"white_balance": None}
+    camera = asdict(balance)
+    return {"chosen_white": camera.pop("chosen"), "white_balance": camera}
 
 
 def deserialise(
@@ -112,7 +123,10 @@ def deserialise(
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
     if "gain" in (facts.get("white_balance") or {}):  # not in maps written before 2026-11-22
-        scene.balance = WhiteBalance(**facts["white_balance"])
+        chosen = ChosenWhite(**facts.get("chosen_white", {}))  # not before 2026-11-27
+        scene.balance = WhiteBalance(**facts["white_balance"], chosen=chosen)
+    if facts.get("tone") is not None:
+        mapper.tone = (int(facts["tone"][0]), ShownTone(**facts["tone"][1]))
     if facts.get("range_variance") is not None:
         raw, restored = facts["range_variance"]
         scene.range_variance = (float(raw), float(restored))
@@ -269,6 +283,10 @@ def _under(prefix: str, arrays: Mapping[str, Any], device: torch.device) -> dict
 # A copy of what is shown of a map, which goes on being mapped meanwhile.
 
 
+MOST_JUDGED = 20_000
+"""Gaussians that the tone of a copy is judged by: some milliseconds."""
+
+
 @dataclass(frozen=True)
 class MapCopy:
     """Copies of the shown parts of a map, for any thread."""
@@ -277,9 +295,11 @@ class MapCopy:
     steps: npt.NDArray[np.int32]
     """[N] optimiser steps of each Gaussian."""
     clear: npt.NDArray[np.float32]
-    """[N, 3] without water."""
+    """[N, 3] without water, as shown in ``tone``."""
     water: npt.NDArray[np.float32] | None
     """[6, 3] beta, B_inf, b, B_res, d as the last camera sees it, and the gain of ``clear``."""
+    tone: ShownTone
+    """Judged by the Gaussians: of a map that grows, no view stands for all."""
     views: list[Sim3]
     """T_wc of the mapped views; the last one is the newest."""
 
@@ -289,7 +309,7 @@ def copy_map(mapper: Mapper) -> MapCopy:
     """In the mapping thread: a copy; a tenth of a second for 150,000 Gaussians."""
     tensors = mapper.gaussians.parameters
     plain = {name: map_out(tensor) for name, tensor in tensors.items()}
-    clear = restored_gaussians(mapper.scene, radiance(tensors["raw_colours"]), mapper.views)
+    clear, tone = _toned(mapper, tensors)
     view = mapper.views[-1]
     water = mapper.scene.water(view)
     rows = None
@@ -297,4 +317,21 @@ def copy_map(mapper: Mapper) -> MapCopy:
         rows = map_out(torch.cat([water.stack(), mapper.scene.white_gain()[None]]))
     steps = map_out(mapper.optimiser.adam.steps)
     poses = [each.T_wc for each in mapper.views]
-    return MapCopy(plain, steps, map_out(clear), rows, poses)
+    return MapCopy(plain, steps, clear, rows, tone, poses)
+
+
+def _toned(
+    mapper: Mapper,
+    tensors: Mapping[str, Tensor],  # of a GaussianMap
+) -> tuple[npt.NDArray[np.float32], ShownTone]:
+    """[N, 3] colours without water as they are shown, and their tone."""
+    J = radiance(tensors["raw_colours"])
+    seen, recovered = seen_and_restored(mapper.scene, J, mapper.views)
+    clear = map_out(recovered.picture)
+    if not mapper.medium.active:
+        return clear, ShownTone()
+    solid = torch.sigmoid(tensors["opacity_logits"][:, 0]) > SOLID
+    judged = np.flatnonzero(map_out(solid & (recovered.confidence > RESTORED)))
+    judged = judged[:: max(1, len(judged) // MOST_JUDGED)]
+    tone = tone_of(map_out(seen)[judged].astype(np.float64), clear[judged].astype(np.float64))
+    return tone.of(clear).astype(np.float32), tone

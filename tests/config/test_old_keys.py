@@ -62,7 +62,7 @@ def test_config_shows_what_a_user_decides_and_with_all_the_labs_too(
     aquaflow: Cli, tmp_path: Path
 ) -> None:
     shown = yaml.safe_load(aquaflow("config").out)
-    assert list(shown["mapping"]["medium"]) == ["enabled", "open_water"]
+    assert list(shown["mapping"]["medium"]) == ["enabled", "open_water", "white_balance"]
     assert "decoder" not in shown["mapping"]
     everything = aquaflow("config", "--all").out
     assert yaml.safe_load(everything)["mapping"]["decoder"]["enabled"] is False

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.mapping.restoration import ShownTone, restored_picture
+from aquaflow.mapping.restoration import restored_picture
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.transfers import insertion_in
 from tests.device.device_scenes import WHERE, SinglePrecision
 from tests.mapping.mapping_scenes import fit_water

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import scene as scene_module
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
+from aquaflow.water.white_balance import ChosenWhite
 from tests.mapping.mapping_scenes import (
     fit_water,
     floor,
@@ -206,6 +209,16 @@ def test_views_whose_red_gain_drifted_do_not_turn_what_is_nearest_red() -> None:
         view.log_gain = torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64)
     rebalance(fitted)
     assert fitted.balance.gain[0] < 0.95 * before[0]
+
+
+def test_a_white_balance_that_was_chosen_outlives_the_next_fit() -> None:
+    fitted, views = submerged()
+    fit_water(fitted, views, random())
+    assert fitted.balance is not None
+    chosen = ChosenWhite("neutral", (1.3, 0.9, 0.8), (0.1, 0.1, 0.1))
+    fitted.balance = replace(fitted.balance, chosen=chosen)
+    fit_water(fitted, views, random())
+    assert fitted.balance.chosen == chosen
 
 
 def test_a_scene_without_water_has_no_balance_to_mend() -> None:

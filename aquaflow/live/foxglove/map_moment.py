@@ -14,9 +14,11 @@ from aquaflow.dive.ply import PlyGaussians
 from aquaflow.dive.point_cloud import PointCloud, PosedView, posed_views
 from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
+from aquaflow.mapping.appearance import seen_and_clear
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import seen_and_clear, to_bytes, tone_of
+from aquaflow.mapping.restoration import to_bytes
 from aquaflow.mapping.state import MapCopy, copy_map
+from aquaflow.mapping.tone import tone_of
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.medium import WaterParameters

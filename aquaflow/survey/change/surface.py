@@ -90,7 +90,7 @@ def surface_of(
     found = fused_surface(views, side, progress)
     mesh, colours = found.mesh, Colours(mapper, T_gm.scale, None)
     balance = mapper.scene.balance
-    grey = np.ones(3) if balance is None else np.asarray(balance.gain)
+    grey = np.ones(3) if balance is None else np.asarray(balance.white)
     shown, sure = [], []
     for part in batches(len(mesh.vertices)):
         seen = look_at(views, mesh.vertices[part], side)

@@ -50,7 +50,8 @@ from aquaflow.dive.ros.topics import (
     require_rosbags,
 )
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import ShownTone, to_bytes
+from aquaflow.mapping.restoration import to_bytes
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
 

@@ -16,11 +16,12 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.restored import view_of_frame
 from aquaflow.geometry.earth import north_east
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.measure.height_field import HeightField
-from aquaflow.survey.measure.picked import PickedPoint, of_map, of_pixel, view_of_frame
+from aquaflow.survey.measure.picked import PickedPoint, of_map, of_pixel
 from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.telemetry.world_frame import WorldFrame
 

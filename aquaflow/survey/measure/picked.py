@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.dive.dive import Dive
+from aquaflow.dive.restored import refuse_outside
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import map_out, picture_out
 from aquaflow.render.views import View
@@ -90,35 +90,6 @@ def measure_pixels(
         ray /= np.linalg.norm(ray)
         points.append(PixelMeasurement(view.T_wc.t + distance * ray, ray, distance, sigma, around))
     return points
-
-
-def view_of_frame(mapper: Mapper, frame: int, dive: Dive) -> View:
-    """The view of a frame.
-
-    Raises:
-        InputError: the frame was not mapped.
-    """
-    views = {view.frame_index: view for view in mapper.views}
-    if frame not in views:
-        nearest = min(views, key=lambda index: abs(index - frame), default=None)
-        other = "" if nearest is None else f"; the nearest mapped one is {nearest}"
-        raise InputError(f"frame {frame} of {dive} was not mapped{other}")
-    return views[frame]
-
-
-def refuse_outside(
-    view: View,
-    pixels: Array,  # [N, 2] px
-) -> None:
-    """Raises InputError for pixels that the mapped picture does not have."""
-    size = np.array([view.camera.width, view.camera.height])
-    for pixel in pixels:
-        if not bool(np.all((pixel >= 0.0) & (pixel < size))):
-            raise InputError(
-                f"the point {pixel[0]:g},{pixel[1]:g} is outside of the mapped picture of "
-                f"{size[0]} x {size[1]} pixels; give pixels of the pictures that `aquaflow export "
-                "--format restored` writes"
-            )
 
 
 def of_pixel(

@@ -17,14 +17,13 @@ import numpy as np
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.restored import refuse_outside, view_of_frame
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View
 from aquaflow.survey.measure.picked import (
     CLICK_SIGMA_PX,
     RANGE_SIGMA,
     measure_pixels,
-    refuse_outside,
-    view_of_frame,
 )
 from aquaflow.survey.measure.reef_numbers import CSV, JSON, write_reef_numbers
 from aquaflow.survey.measure.rescaling import rescale, why_not

@@ -105,6 +105,9 @@ class MediumCurves:
     """Span of ranges z that the dive saw; outside it the curves are extrapolated."""
     unit: str = "map units"
     """Unit of z; beta, b and d are per unit."""
+    white: tuple[str, Rgb, Rgb] | None = None
+    """White balance of restored pictures: name, gain on top of the camera's, and the relative 1
+    sigma of that; None: the camera's."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.medium import NAME as MEDIUM
+from aquaflow.dive.medium import Rgb
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.survey.coverage import PageView
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
@@ -104,9 +105,23 @@ def _medium(dive: Dive) -> MediumCurves | None:
             )
         )  # fmt: skip
         span = float(content["range_p5"]), float(content["range_p95"])
+        white = _white(content.get("restored"))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{dive.file(MEDIUM)} is damaged; map the dive again") from error
-    return MediumCurves(beta, b, B_inf, B_res, d, *span, unit=dive.frame.unit)
+    return MediumCurves(beta, b, B_inf, B_res, d, *span, unit=dive.frame.unit, white=white)
+
+
+def _white(restored: Any) -> tuple[str, Rgb, Rgb] | None:
+    """Name, gain and sigma of a white balance that is not the camera's; before 2026-11-27 none
+    was."""
+    said = restored.get("white_balance") if isinstance(restored, dict) else None
+    if not isinstance(said, dict) or said["sigma"] is None:
+        return None
+    gain, sigma = (
+        (float(red), float(green), float(blue))
+        for red, green, blue in (said["gain"], said["sigma"])
+    )
+    return str(said["choice"]), gain, sigma
 
 
 def _reef(dive: Dive) -> list[ReefRow]:

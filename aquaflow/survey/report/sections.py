@@ -393,6 +393,12 @@ def water_rows(data: MediumCurves) -> Rows:
     rows: Rows = [(name, *(form.format(value) for value in values)) for name, values, form in named]
     halves = [f"{np.log(2.0) / value:.2f}" if value > 0.0 else "" for value in data.beta]
     rows.append((f"half of the light is lost over, {data.unit}", *halves))
+    if data.white is not None:
+        name, *numbers = data.white
+        gains = [
+            f"{gain:.2f} \u00b1 {gain * sigma:.2f}" for gain, sigma in zip(*numbers, strict=True)
+        ]
+        rows.append((f"gain of the white balance, {name}", *gains))
     return rows
 
 

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -143,25 +143,40 @@ def fill(page: ViewerPage, dive: FinishedDive) -> None:
         page.show_camera(path.poses[0], dive.camera, None)
 
 
-def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> ViewerPage:
-    """The page of the finished dive in ``folder``, with its notes and, by ``mark``, its scale bar.
+def open_dive(
+    folder: Path,
+    config: ViewerConfig,
+    mark: Mark | None = None,
+    white_balance: str | None = None,
+) -> ViewerPage:
+    """The page of the finished dive in ``folder``, with its notes and, by ``mark``, its scale bar;
+    in another ``white_balance`` than its own, where one is given.
 
     Raises:
-        InputError: there is no finished dive, or the address is taken.
+        InputError: there is no finished dive, the address is taken, or the dive cannot be shown in
+            that white balance.
         ConfigError: the token will not do.
     """
     tools = Tools(others=PinnedNotes(folder).tools())
     page: list[ViewerPage] = []
 
+    def opened() -> FinishedDive:
+        dive = Dive(folder)
+        if white_balance is not None:
+            from aquaflow.dive.white_balance import show_in  # loads torch
+
+            show_in(dive, white_balance)
+        return finished_dive(dive, config.splats)
+
     def scale(given: Asked) -> Asked:
         said = mark_coverage(given, mark) if mark is not None else {}
         if said.get("rescaled"):
-            fill(page[0], finished_dive(Dive(folder), config.splats))
+            fill(page[0], opened())
         return said
 
     if mark is not None:
         tools.others[SCALE] = scale
-    dive = finished_dive(Dive(folder), config.splats)
+    dive = opened()
     page.append(show_dive(dive, config, tools))
     prepare(folder, dive.key, dive.packed, dive.map, page[0])
     return page[0]
@@ -195,10 +210,30 @@ def prepare(
 def _water(dive: Dive) -> SeenWater | None:
     """None for a dive without water, and for a file that does not say it."""
     try:
-        return water_of(dive.medium_facts)
+        water = water_of(dive.medium_facts)
+        if water is None or dive.white_balance is None:
+            return water
+        return in_chosen_white(dive, water)
     except (InputError, ValueError, AttributeError, DamagedError) as error:
         log.warning("the viewer shows no water: %s: %s", dive, reason_of(error))
         return None
+
+
+def in_chosen_white(dive: Dive, water: SeenWater) -> SeenWater:
+    """The water, with the white balance and tone that were chosen for the dive's map since.
+
+    Raises:
+        InputError: its map is missing or damaged.
+    """
+    from aquaflow.mapping.appearance import shown_tone  # loads torch
+
+    mapper = dive.map()
+    tone, balance = shown_tone(mapper), mapper.scene.balance
+    assert balance is not None
+    red, green, blue = (
+        tone.exposure * now / before for now, before in zip(balance.white, water.gain, strict=True)
+    )
+    return replace(water, white=(red, green, blue), shown_compression=tone.compression)
 
 
 # --------------------------------------------------------------------------------------------------

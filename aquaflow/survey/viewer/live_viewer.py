@@ -269,6 +269,10 @@ def _water(copy: MapCopy) -> SeenWater | None:
     away = np.linalg.norm(copy.parameters["means"] - copy.views[-1].t, axis=1)
     try:
         beta, B_inf, b, B_res, d, gain = copy.water
-        return seen_water(beta, B_inf, b, B_res, d, gain, float(np.median(away)))
+        tone = copy.tone
+        return seen_water(
+            beta, B_inf, b, B_res, d, tone.exposure * gain, float(np.median(away)),
+            tone.compression, shown_compression=tone.compression,
+        )  # fmt: skip
     except ValueError:
         return None

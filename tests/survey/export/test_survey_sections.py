@@ -107,6 +107,13 @@ def test_the_water_is_in_numbers_of_a_unit_that_is_said() -> None:
     }
 
 
+def test_a_chosen_white_balance_is_reported_with_its_certainty() -> None:
+    chosen = replace(WATER, white=("neutral", (1.42, 0.94, 0.86), (0.1, 0.05, 0.05)))
+    name, *values = survey_sections.water_rows(chosen)[-1]
+    assert name == "gain of the white balance, neutral"
+    assert values == ["1.42 \u00b1 0.14", "0.94 \u00b1 0.05", "0.86 \u00b1 0.04"]
+
+
 def rows(depth: float | None, altitude: float | None, unit: str = "m") -> list[PoseRow]:
     return [
         PoseRow(i, 0.1 * i, None, 0, 0.0, 0.0, 5.0, unit, depth_m=depth, altitude_m=altitude)

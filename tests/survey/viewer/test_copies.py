@@ -9,6 +9,7 @@ import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.state import MapCopy
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.live_viewer import pack_for_browser
 
@@ -21,7 +22,7 @@ def copied(count: int) -> MapCopy:
     }  # fmt: skip
     plain = {name: values.astype(np.float32) for name, values in parameters.items()}
     clear = np.full((count, 3), 0.5, np.float32)
-    return MapCopy(plain, np.ones(count, np.int32), clear, None, [Sim3.identity()])
+    return MapCopy(plain, np.ones(count, np.int32), clear, None, ShownTone(), [Sim3.identity()])
 
 
 def test_gaussians_are_coloured_by_the_plan_of_their_sub_map() -> None:

@@ -20,6 +20,7 @@ from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.finished import finished_dive, open_dive
 from aquaflow.survey.viewer.page import ViewerPage
+from aquaflow.survey.viewer.seen_water import water_of
 from aquaflow.survey.viewer.splats import splats
 from aquaflow.survey.viewer.tools import PinnedNotes, Tools
 from aquaflow.telemetry.metric_file import write_metric_file
@@ -98,6 +99,24 @@ def test_the_water_of_a_dive_is_read_and_a_damaged_one_costs_itself(dive: Path) 
     for damage in ("{", json.dumps(medium | {"backscatter": None}), "[]"):
         (dive / "medium.json").write_text(damage)
         assert finished_dive(Dive(dive), budget=50).water is None
+
+
+def test_a_dive_is_shown_in_its_tone_whether_its_colours_have_it_or_not() -> None:
+    rates = {"B_inf": [0.1, 0.2, 0.3], "b": [0.3] * 3, "B_res": [0.0] * 3, "d": [0.3] * 3}
+    restored = {"gain": [0.5, 1.0, 2.0], "exposure": 1.5, "highlight_compression": 3.0}
+    medium: dict[str, Any] = {
+        "active": True, "attenuation_per_unit": [0.5, 0.2, 0.2], "backscatter": rates,
+        "map_ply_reference_range": 2.5,
+    }  # fmt: skip
+    white = {"choice": "camera", "gain": [1.0] * 3, "sigma": None}
+    now = water_of(medium | {"restored": restored | {"white_balance": white}})
+    assert now is not None
+    assert (now.gain, now.white) == ((0.75, 1.5, 3.0), (1.0, 1.0, 1.0))
+    assert now.compression == now.shown_compression == 3.0
+    before = water_of(medium | {"restored": restored | {"white_balance": "as the camera saw"}})
+    assert before is not None
+    assert (before.gain, before.white) == ((0.5, 1.0, 2.0), (1.5, 1.5, 1.5))
+    assert (before.compression, before.shown_compression) == (0.0, 3.0)
 
 
 def test_a_metric_dive_says_its_unit_and_has_its_z_axis_down(dive: Path) -> None:

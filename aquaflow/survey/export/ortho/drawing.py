@@ -17,14 +17,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from aquaflow.dive.map_file import splats_of
+from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import (
-    ShownTone,
-    mean_water,
-    restored_radiance,
-    restored_tone,
-    to_bytes,
-)
+from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
+from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
 from aquaflow.survey.export.ortho.grid import Grid, GridTile
@@ -162,7 +158,7 @@ class Colours:
         look through, in the ground's unit, or None for no water."""
         self._scene, self._unit, self._through = mapper.scene, unit, water_range
         self._water = mean_water(mapper.scene, mapper.views)
-        self._tone = restored_tone(mapper) if water_range is None else ShownTone()
+        self._tone = shown_tone(mapper) if water_range is None else ShownTone()
 
     @property
     def device(self) -> torch.device:

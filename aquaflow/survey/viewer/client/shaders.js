@@ -6,7 +6,7 @@ precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D data; uniform sampler2D palette;
 uniform mat3 axes; uniform vec3 place; uniform vec2 focal, centre, size;
 uniform vec3 middle, extent; uniform vec2 logScales; uniform float brightest, grown, nearest;
-uniform vec3 beta, Binf, b, Bres, d, gain; uniform float water, through;
+uniform vec3 beta, Binf, b, Bres, d, gain, white; uniform float water, through, compression, shownCompression;
 uniform int level, rangeLevel; uniform float within;
 in vec2 corner; in uint index;
 out vec4 colour; out vec2 at;
@@ -27,10 +27,17 @@ mat3 rotation(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
+// Highlights drawn together, or with -c apart again (aquaflow/mapping/tone.py).
+vec3 toned(vec3 bright, float c) {
+  vec3 above = max(bright - 0.8, 0.0);
+  return min(bright, 0.8) + above / max(1.0 + c * above, 0.02);
+}
+
 vec3 throughWater(vec3 clear, float range) {
   float z = min(range, through) * water;
   vec3 veil = Binf * (1.0 - exp(-b * z)) + water * Bres * exp(-d * z);
-  return clear * pow(gain, vec3(-water)) * exp(-beta * z) + veil;
+  vec3 restored = toned(clear, -compression) * pow(white, vec3(1.0 - water)) * pow(gain, vec3(-water));
+  return toned(restored * exp(-beta * z) + veil, shownCompression * (1.0 - water));
 }
 
 void main() {

@@ -1,0 +1,164 @@
+"""How a map's restored colours are shown: the white balance that was chosen, and one tone.
+
+Both are judged by the map itself, drawn from some of its views through the water and without it, so
+that they can be chosen anew for a finished dive, whose map has no pictures. They are kept with the
+map until it is optimised further.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from aquaflow.mapping.restoration import RESTORED, mean_water, restored_own
+from aquaflow.mapping.scene import RenderedMap, Scene
+from aquaflow.mapping.tone import ShownTone, tone_of
+from aquaflow.render.transfers import picture_out, water_out
+from aquaflow.render.views import View, in_time
+from aquaflow.water.illuminant import (
+    SCENE_ERROR,
+    Illuminant,
+    gain_to_grey,
+    illuminant_of,
+    methods_in,
+)
+from aquaflow.water.sightings import SOLID
+from aquaflow.water.white_balance import NEUTRAL, ChosenWhite
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+
+Array = npt.NDArray[np.float64]
+
+LOOKS = 20
+"""Views, spread over the dive, that white balance and tone are judged by."""
+LOOK_PIXELS = 4000
+"""Of each of them, on a grid: mean lightness to a tenth of a unit."""
+CLIPPED = 0.97
+"""Seen value from which a channel may be cut off, and then says nothing of the light's colour."""
+
+
+@dataclass(frozen=True)
+class Grey:
+    """A place that is said to be grey."""
+
+    name: str
+    """``FRAME:X,Y``"""
+    colour: Array
+    """[3] RGB of the map there, restored in the camera's white balance."""
+    z: float
+    """Its range, map units."""
+    pixels: int
+    """That the colour is the mean of."""
+
+
+def shown_tone(mapper: Mapper) -> ShownTone:
+    """The tone of all restored pictures of the map; drawn and judged where it is not known yet, and
+    the white balance of the map's settings with it. A map without water has none."""
+    if not mapper.medium.active:
+        return ShownTone()
+    if mapper.tone is None or mapper.tone[0] != mapper.steps:
+        choose(mapper, mapper.config.medium.white_balance)
+    assert mapper.tone is not None
+    return mapper.tone[1]
+
+
+@torch.no_grad()
+def choose(mapper: Mapper, choice: Literal["camera", "neutral"] | Grey) -> None:
+    """Show the restored colours of a map in water in this white balance from now on; in the
+    camera's, where too little was restored to say what is neutral."""
+    _set_white(mapper.scene, ChosenWhite())
+    fitted = mapper.scene.balance is not None
+    looks = _looks(mapper, find_light=fitted and choice == NEUTRAL)
+    if isinstance(choice, Grey):
+        _set_white(mapper.scene, _white_of(mapper, choice.name, _said(choice), choice))
+    elif looks.light is not None:
+        _set_white(mapper.scene, _white_of(mapper, NEUTRAL, looks.light))
+    gain = np.ones(3) if mapper.scene.balance is None else mapper.scene.balance.chosen.gain
+    mapper.tone = (mapper.steps, tone_of(looks.seen, looks.clear * gain))
+
+
+def _set_white(scene: Scene, white: ChosenWhite) -> None:
+    if scene.balance is not None:
+        scene.balance = replace(scene.balance, chosen=white)
+
+
+def _said(grey: Grey) -> Illuminant:
+    log = np.log(grey.colour)
+    return Illuminant(log - log.mean(), np.zeros(3))
+
+
+def _white_of(
+    mapper: Mapper, name: str, light: Illuminant, place: Grey | None = None
+) -> ChosenWhite:
+    """The gain that makes ``light`` grey, as far as the light at ``place``, or of what is nearest,
+    allows."""
+    balance, water = mapper.scene.balance, mean_water(mapper.scene, mapper.views)
+    if balance is None or water is None:
+        return ChosenWhite(name)
+    mean = np.multiply(balance.mean, balance.gain)
+    z, pixels = (balance.near_range, 1) if place is None else (place.z, place.pixels)
+    noise = water_out(balance.noise_of_light(water, z, pixels))
+    assumed = SCENE_ERROR if place is None else 0.0
+    return ChosenWhite(name, *gain_to_grey(light, noise, mean, assumed))
+
+
+# --------------------------------------------------------------------------------------------------
+# What the map looks like from some of its views.
+
+
+@dataclass(frozen=True)
+class _Looks:
+    seen: Array
+    """[n, 3] colours through the water."""
+    clear: Array
+    """[n, 3] the same without it."""
+    light: Illuminant | None
+    """The colour of the light; None where it was not asked for, or too little is to be seen."""
+
+
+def _looks(mapper: Mapper, find_light: bool) -> _Looks:
+    spread = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
+    samples = [(np.zeros((0, 3)), np.zeros((0, 3)))]
+    said, weights = list[Array](), list[float]()
+    for view in spread:
+        shown = mapper.show(view)
+        samples.append(seen_and_clear(mapper.scene, view, shown))
+        if find_light:
+            picture, weight = _weighted(mapper.scene, view, shown)
+            if (found := methods_in(picture, weight)) is not None:
+                said.append(found)
+                weights.append(float(weight.sum()))
+    seen, clear = (np.concatenate(each) for each in zip(*samples, strict=True))
+    return _Looks(seen, clear, illuminant_of(said, weights))
+
+
+@torch.no_grad()
+def seen_and_clear(scene: Scene, view: View, shown: RenderedMap) -> tuple[Array, Array]:
+    """[n, 3] colours of what is solid and was restored rather than filled in, through the water and
+    without it."""
+    step = max(1, round((shown.alpha.numel() / LOOK_PIXELS) ** 0.5))
+    grid = (slice(step // 2, None, step), slice(step // 2, None, step))
+    own = restored_own(scene, view, shown)
+    judged = ((shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED))[grid]
+    seen, clear = shown.image[grid][judged], own.picture[grid][judged]
+    return picture_out(seen).astype(np.float64), picture_out(clear).astype(np.float64)
+
+
+def _weighted(
+    scene: Scene, view: View, shown: RenderedMap
+) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
+    """[H, W, 3] the map from the view without its water, and [H, W] how much each pixel says of the
+    light: its confidence, less the further away it is than what is nearest."""
+    own = restored_own(scene, view, shown)
+    usable = (shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED)
+    usable = usable & torch.isfinite(own.picture).all(dim=-1)
+    usable = usable & (shown.image.amax(dim=-1) < CLIPPED)
+    near = 0.0 if scene.balance is None else scene.balance.near_range
+    weight = own.confidence * (near / shown.z.clamp_min(near)).square()
+    weight = torch.where(usable, weight, 0.0)
+    return picture_out(torch.where(usable[..., None], own.picture, 0.0)), picture_out(weight)
