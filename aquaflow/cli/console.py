@@ -44,6 +44,14 @@ class GroupWithDefault(TyperGroup):
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 
+WhiteBalanceOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Of colours without water: camera (as it saw what was nearest), neutral (the scene's "
+        "light is grey), or FRAME:X,Y, a pixel that is grey; else as the dive was mapped."
+    ),
+]
+
 PRESETS = "fast | balanced | accurate | onboard-gpu | paper; the last two never measured on a GPU"
 """Help of --preset; a test holds it to the presets that there are."""
 

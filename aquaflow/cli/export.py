@@ -13,7 +13,7 @@ import typer
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import refuse_linked_folders
-from aquaflow.cli.console import GroupWithDefault, Json, progress_bars
+from aquaflow.cli.console import GroupWithDefault, Json, WhiteBalanceOption, progress_bars
 
 if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
@@ -52,18 +52,18 @@ NAMES = {
 }
 """Of what is written, in the dive's folder."""
 OPTIONS = {
-    ExportFormat.restored: {"--recording"},
-    ExportFormat.laz: {"--water"},
-    ExportFormat.e57: {"--water"},
-    ExportFormat.colmap: {"--recording", "--restored"},
-    ExportFormat.nerfstudio: {"--recording", "--restored"},
-    ExportFormat.spz: {"--water"},
-    ExportFormat.ply: {"--water", "--resolution"},
-    ExportFormat.obj: {"--water", "--resolution"},
-    ExportFormat.glb: {"--water", "--resolution"},
-    ExportFormat.ortho: {"--water", "--resolution"},
+    ExportFormat.restored: {"--recording", "--white-balance"},
+    ExportFormat.laz: {"--water", "--white-balance"},
+    ExportFormat.e57: {"--water", "--white-balance"},
+    ExportFormat.colmap: {"--recording", "--restored", "--white-balance"},
+    ExportFormat.nerfstudio: {"--recording", "--restored", "--white-balance"},
+    ExportFormat.spz: {"--water", "--white-balance"},
+    ExportFormat.ply: {"--water", "--resolution", "--white-balance"},
+    ExportFormat.obj: {"--water", "--resolution", "--white-balance"},
+    ExportFormat.glb: {"--water", "--resolution", "--white-balance"},
+    ExportFormat.ortho: {"--water", "--resolution", "--white-balance"},
     ExportFormat.dem: {"--resolution"},
-    ExportFormat.mcap: {"--recording"},
+    ExportFormat.mcap: {"--recording", "--white-balance"},
 }
 """Which options a format knows, besides --out and --json."""
 MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
@@ -72,6 +72,8 @@ MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
     ExportFormat.glb: "glb",
 }
 """Formats that are triangles."""
+POSED = {ExportFormat.colmap, ExportFormat.nerfstudio}
+"""Formats of pictures that are as the camera saw them unless ``--restored`` says otherwise."""
 REPORT = "report.pdf"
 """In the dive's folder, where no other place is given."""
 
@@ -116,6 +118,7 @@ def export(
             help="m a pixel or voxel (map units without metres); without it, as in the pictures."
         ),
     ] = None,
+    white_balance: WhiteBalanceOption = None,
     out: Annotated[
         Path | None, typer.Option(help="File or folder to write; else in the dive's.")
     ] = None,
@@ -124,7 +127,7 @@ def export(
     """Write a dive for other programs: pictures without water, points, posed pictures, maps."""
     given = {
         "--recording": recording is not None, "--restored": restored, "--water": water,
-        "--resolution": resolution is not None,
+        "--resolution": resolution is not None, "--white-balance": white_balance is not None,
     }  # fmt: skip
     _refuse_others(format, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
@@ -133,6 +136,9 @@ def export(
 
     read = Dive(dive)
     read.require(MAP)
+    if white_balance is not None:
+        shows_water = water or (format in POSED and not restored)
+        _choose_white(read, white_balance, shows_water)
     target = _make_parents(out) if out else _own_target(dive / NAMES[format])
     with progress_bars(quiet=as_json) as bars:
 
@@ -203,6 +209,17 @@ def _own_target(path: Path) -> Path:
             f"cannot write to {error.filename}: {error.strerror}; remove it, or give --out"
         ) from error
     return path
+
+
+def _choose_white(dive: Dive, white_balance: str, shows_water: bool) -> None:
+    if shows_water:
+        raise InputError(
+            "a white balance is of colours without water, and these are as the camera saw them; "
+            "leave --white-balance out"
+        )
+    from aquaflow.dive.white_balance import show_in
+
+    show_in(dive, white_balance)
 
 
 def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
@@ -349,9 +366,9 @@ class VideoKind(str, Enum):
 
 
 VIDEO_OPTIONS = {
-    VideoKind.side_by_side: {"--recording"},
-    VideoKind.fly_through: {"--water", "--seconds", "--width"},
-    VideoKind.restored: {"--recording", "--width"},
+    VideoKind.side_by_side: {"--recording", "--white-balance"},
+    VideoKind.fly_through: {"--water", "--seconds", "--width", "--white-balance"},
+    VideoKind.restored: {"--recording", "--width", "--white-balance"},
 }
 """Which options a kind knows, besides --out and --json."""
 FLIGHT_S = 20.0
@@ -378,18 +395,21 @@ def video(
     ] = False,
     seconds: Annotated[float | None, typer.Option(help="Length of a flight; 20.")] = None,
     width: Annotated[int | None, typer.Option(help="Pixels; else as mapped.")] = None,
+    white_balance: WhiteBalanceOption = None,
     as_json: Json = False,
 ) -> None:
     """Make a video of a dive, for browsers: a flight through the map, or its pictures restored."""
     given = {
         "--recording": recording is not None, "--water": water, "--seconds": seconds is not None,
-        "--width": width is not None,
+        "--width": width is not None, "--white-balance": white_balance is not None,
     }  # fmt: skip
     _refuse(kind, given, seconds, width)
     from aquaflow.dive.dive import MAP, Dive
 
     read = Dive(dive)
     read.require(MAP)
+    if white_balance is not None:
+        _choose_white(read, white_balance, water)
     _make_parents(out)
     with progress_bars(quiet=as_json) as bars:
 

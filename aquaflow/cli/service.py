@@ -17,6 +17,7 @@ from aquaflow.cli.console import (
     InSite,
     Json,
     Seconds,
+    WhiteBalanceOption,
     checked_site,
     devices_on_stderr,
     progress_bars,
@@ -154,6 +155,7 @@ def view(
         Path | None, typer.Option(help="File that holds the token; needed beyond this machine.")
     ] = None,
     splats: Annotated[int, typer.Option(help="Gaussians to show at most.")] = MOST_SPLATS,
+    white_balance: WhiteBalanceOption = None,
 ) -> None:
     """Show a finished dive or a site in a browser, to look around and to measure; until Ctrl-C."""
     from aquaflow.base.errors import InputError
@@ -166,9 +168,13 @@ def view(
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
     config = validate(ViewerConfig, asked | {"splats": splats}, "command line")
     if is_site(dive):
+        if white_balance is not None:
+            raise InputError(
+                f"{dive} is a site, whose dives have one each; leave --white-balance out"
+            )
         window = open_site(dive, config, component)
     elif component is None:
-        window = open_dive(dive, config, partial(_mark, dive))
+        window = open_dive(dive, config, partial(_mark, dive), white_balance)
         if said := note_unfinished(dive):
             typer.echo(f"Warning: {said}.", err=True)
     else:
