@@ -19,12 +19,12 @@ from aquaflow.mapping.restoration import (
     to_bytes,
 )
 from aquaflow.mapping.scene import RenderedMap
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
 from aquaflow.slam import Slam
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.tone import ShownTone
 
 REGISTERING = 0.85
 """Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a

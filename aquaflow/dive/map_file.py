@@ -206,6 +206,7 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
         None if balance is None or balance.chosen.sigma is None else list(balance.chosen.sigma),
         None if balance is None else balance.near_range,
         mapper.scene.range_variance,
+        mapper.scene.lightness_over_range,
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),
         mapper.scene.unevenness().tolist(),

@@ -24,11 +24,11 @@ from aquaflow.mapping.restoration import (
     restored_picture,
 )
 from aquaflow.mapping.scene import RenderedMap
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.views import View, in_time
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.types import Frame
+from aquaflow.water.tone import ShownTone
 
 Progress = Callable[[int, int], None]
 

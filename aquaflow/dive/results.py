@@ -57,6 +57,8 @@ class WaterSummary:
     """Range whose colours restored pictures keep; None if there was no fit."""
     range_variance: tuple[float, float] | None
     """Relative variance of the points' colours that follows from their range: seen, restored."""
+    lightness_over_range: tuple[float, float] | None
+    """L* of the same ground, far over near: seen, restored."""
     beta_a_sigma: list[float] | None
     """Relative standard deviation of beta_a; None if the ranges seen never allowed a fit."""
     shading: list[float]
@@ -66,7 +68,7 @@ class WaterSummary:
     exposure: float
     """One gain of all that is restored, on top of ``white_gain``."""
     highlight_compression: float
-    """Of their highlights, see :class:`aquaflow.mapping.restoration.ShownTone`."""
+    """Of their highlights, see :class:`aquaflow.water.tone.ShownTone`."""
 
 
 def largest_sub_map(results: list[Tracked]) -> int:
@@ -202,6 +204,8 @@ def medium_json(
         },
         "colour_variance_over_range": water.range_variance
         and dict(zip(("seen", "restored"), water.range_variance, strict=True)),
+        "lightness_over_range": water.lightness_over_range
+        and dict(zip(("seen", "restored"), water.lightness_over_range, strict=True)),
         "shading_log_gain": water.shading,
         "backscatter_log_gain": water.unevenness,
         "log_gain_terms": ["x", "y", "x^2", "x y", "y^2"],

@@ -16,7 +16,6 @@ import torch
 
 from aquaflow.mapping.restoration import RESTORED, mean_water, restored_own
 from aquaflow.mapping.scene import RenderedMap, Scene
-from aquaflow.mapping.tone import ShownTone, tone_of
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
 from aquaflow.water.illuminant import (
@@ -27,6 +26,7 @@ from aquaflow.water.illuminant import (
     methods_in,
 )
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.tone import ShownTone, tone_of
 from aquaflow.water.white_balance import NEUTRAL, ChosenWhite
 
 if TYPE_CHECKING:

@@ -38,11 +38,11 @@ from aquaflow.mapping.optimisation import (
 )
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.mapping.scene_water import WaterFitting, rebalance
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.contract import Renderer
 from aquaflow.render.gsplat import give_back_after
 from aquaflow.render.views import View, in_time
 from aquaflow.water.medium import LearnedMedium
+from aquaflow.water.tone import ShownTone
 
 MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""

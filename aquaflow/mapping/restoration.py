@@ -13,12 +13,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.mapping.scene import RenderedMap, Scene, orientations
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.transfers import map_out, picture_out, water_in
 from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID
 from aquaflow.water.medium import MIN_TRANSMISSION, WaterParameters
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.tone import ShownTone
 from aquaflow.water.white_balance import Recovered
 
 EDGE_PX = 3.0

@@ -63,6 +63,9 @@ class Scene:
         """What the views of the last fit showed nearest."""
         self.range_variance: tuple[float, float] | None = None
         """Of the points' colours in the last fit, with the water and without; None before it."""
+        self.lightness_over_range: tuple[float, float] | None = None
+        """Of the same ground in the last fit, far over near, with the water and without; None where
+        too little was seen from both."""
         self.gain_maps: dict[tuple[str, int, int], Tensor | None] = {}
 
     def water(self, view: View) -> WaterParameters | None:

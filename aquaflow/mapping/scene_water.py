@@ -126,6 +126,7 @@ def _adopt(
     scene.shading, scene.exposes = estimate.shading, estimate.model.exposure
     scene.beta_a_sigma, scene.water_evidence = estimate.beta_a_sigma, estimate.evidence
     scene.balance, scene.range_variance = _as_chosen(scene, estimate), estimate.range_variance
+    scene.lightness_over_range = estimate.lightness_over_range
     if estimate.nearest is not None:
         scene.seen_nearest = estimate.nearest, list(fitted)
     scene.gain_maps.clear()

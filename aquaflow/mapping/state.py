@@ -34,7 +34,6 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.mapping.restoration import RESTORED, seen_and_restored
-from aquaflow.mapping.tone import ShownTone, tone_of
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.dense_adam import STEP, DenseAdam
@@ -42,6 +41,7 @@ from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
 from aquaflow.water.exposure import log_gains_of, set_log_gain
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.tone import ShownTone, tone_of
 from aquaflow.water.white_balance import ChosenWhite, WhiteBalance
 
 Facts = dict[str, Any]
@@ -65,6 +65,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         **_white_facts(scene.balance),
         "tone": None if mapper.tone is None else [mapper.tone[0], asdict(mapper.tone[1])],
         "range_variance": scene.range_variance,
+        "lightness_over_range": scene.lightness_over_range,
         "decoder": mapper.neural is not None,
         "optimiser": optimiser,
         "steps": mapper.steps,
@@ -127,9 +128,10 @@ def deserialise(
         scene.balance = WhiteBalance(**facts["white_balance"], chosen=chosen)
     if facts.get("tone") is not None:
         mapper.tone = (int(facts["tone"][0]), ShownTone(**facts["tone"][1]))
-    if facts.get("range_variance") is not None:
-        raw, restored = facts["range_variance"]
-        scene.range_variance = (float(raw), float(restored))
+    for name in ("range_variance", "lightness_over_range"):  # the latter not before 2026-11-27
+        if facts.get(name) is not None:
+            raw, restored = facts[name]
+            setattr(scene, name, (float(raw), float(restored)))
     mapper.optimiser.steps, mapper.optimiser.undone = int(facts["steps"]), int(facts["undone"])
     if len(facts["cameras"]) > len(arrays["views.numbers"]):
         raise DamagedError("it has more cameras than views")

@@ -38,7 +38,11 @@ from aquaflow.water.model import (
     rate_rows,
 )
 from aquaflow.water.nearest import Nearest, nearest_of, white_balance
-from aquaflow.water.observations import Observations, variance_over_range
+from aquaflow.water.observations import (
+    Observations,
+    lightness_over_range,
+    variance_over_range,
+)
 from aquaflow.water.open_sightings import with_open_water
 from aquaflow.water.sightings import PosedPicture
 from aquaflow.water.white_balance import WhiteBalance
@@ -90,6 +94,9 @@ class WaterEstimate:
     range_variance: tuple[float, float]
     """Relative variance of the points' colours that follows from their range: as the camera saw
     them, and without water."""
+    lightness_over_range: tuple[float, float] | None
+    """Of the same ground, far over near: as the camera saw it, and without water; None where too
+    little was seen from near and far, and without water."""
 
 
 def models_for(config: MediumConfig) -> list[Model]:
@@ -151,7 +158,7 @@ def _estimate(
     """What the fit, perhaps to open water too, says of the observations of the surface."""
     seen, trial, water = observations, best.prediction.trial, best.problem
     range_variance = [variance_over_range(seen, seen.colour)] * 2
-    sigma = nearest = balance = None
+    sigma = nearest = balance = lightness = None
     if water.model.water:
         sigma = _beta_a_sigma(best)
         J = best.prediction.J[:, : seen.points]
@@ -159,6 +166,8 @@ def _estimate(
         balance = white_balance(nearest, water, trial, J, sigma)
         clean = water.without_water(trial, seen.view, seen.xy, seen.z, seen.colour)
         range_variance[1] = variance_over_range(seen, clean.T)
+        far = [lightness_over_range(seen, each) for each in (seen.colour, clean.T * balance.gain)]
+        lightness = None if far[0] is None or far[1] is None else (far[0], far[1])
     return WaterEstimate(
         water.model,
         trial.beta_a,
@@ -172,6 +181,7 @@ def _estimate(
         nearest,
         balance,
         (range_variance[0], range_variance[1]),
+        lightness,
     )
 
 

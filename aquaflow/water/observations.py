@@ -10,12 +10,17 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.water.tone import lightness
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 OPEN_WATER_ERROR = 2.0
 """Standard deviation of open water's errors over that of a patch: what looks open may be ground
 that is dim and far. Taken at its word, beta_a of murky rendered dives was 5 to 10 % too small."""
+APART, FEWEST_APART = 1.25, 20
+"""Ratio of ranges from which a point was seen from near and from far; and how many such points tell
+how light the ground is from both."""
 LEAST_COLOUR = 0.02
 """Guards the division by a black patch's colour."""
 
@@ -101,6 +106,22 @@ def variance_over_range(
     spread = float((nearness**2).mean())
     slopes = (nearness[:, None] * (colours / mean - 1.0)).mean(axis=0) / max(spread, 1e-12)
     return float((slopes**2).mean() * spread)
+
+
+def lightness_over_range(
+    observations: Observations,
+    colours: Array,  # [M, 3] of the same observations, as on a screen (sRGB)
+) -> float | None:
+    """Mean L* (CIELAB) of the points that were seen from near and far as the farthest view has it
+    over that of the nearest; None with too few of them."""
+    seen = observations
+    by_range = np.lexsort((seen.z, seen.point))
+    near, far = by_range[seen.starts], by_range[np.append(seen.starts[1:], len(seen.z)) - 1]
+    apart = seen.z[far] > APART * seen.z[near]
+    if apart.sum() < FEWEST_APART:
+        return None
+    L = lightness(colours)
+    return float(L[far[apart]].mean() / max(L[near[apart]].mean(), 1.0))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ import torch
 from aquaflow.mapping.restoration import restored_picture
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.transfers import insertion_in
+from aquaflow.water.tone import ShownTone
 from tests.device.device_scenes import WHERE, SinglePrecision
 from tests.mapping.mapping_scenes import fit_water
 from tests.mapping.water_scenes import in_clear_water, submerged

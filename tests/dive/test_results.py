@@ -114,6 +114,7 @@ def test_a_summary_becomes_the_water_it_describes() -> None:
         chosen_gain_sigma=None,
         near_range=0.7,
         range_variance=(0.04, 0.01),
+        lightness_over_range=(0.8, 1.0),
         beta_a_sigma=None,
         shading=[0.0] * 5,
         unevenness=[0.0] * 5,

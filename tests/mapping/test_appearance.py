@@ -16,13 +16,13 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import drawn_without_water, restored_gaussians
 from aquaflow.mapping.scene import RenderedMap
 from aquaflow.mapping.state import copy_map, deserialise, serialise
-from aquaflow.mapping.tone import ShownTone, lightness
 from aquaflow.render.contract import radiance
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
 from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.illuminant import LUMINANCE
+from aquaflow.water.tone import ShownTone, lightness
 from tests.mapping.grey_floor import CAST, mapped
 from tests.mapping.mapping_scenes import renderer
 

@@ -13,8 +13,8 @@ from aquaflow.mapping.restoration import (
     to_bytes,
 )
 from aquaflow.mapping.scene import RenderedMap, Scene
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.views import View
+from aquaflow.water.tone import ShownTone
 from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from aquaflow.water.observations import FEWEST, RegionalColours, regions_of
+from aquaflow.water.observations import (
+    FEWEST,
+    RegionalColours,
+    lightness_over_range,
+    regions_of,
+)
 from tests.water.decision_table import kinds, row
 from tests.water.simulated_dives import Kind, dive
 from tests.water.water_observations import fitted, sighted
@@ -34,6 +41,16 @@ def test_without_water_points_look_the_same_from_all_ranges() -> None:
     estimate = fitted(sighted(points=600))
     seen, restored = estimate.range_variance
     assert restored < 0.1 * seen
+    assert estimate.lightness_over_range is not None
+    seen, restored = estimate.lightness_over_range
+    assert abs(restored - 1.0) < 0.02 < abs(seen - 1.0)
+
+
+def test_how_light_ground_is_from_far_is_not_told_where_none_was_seen_from_near_and_far() -> None:
+    seen = sighted(points=200)
+    assert lightness_over_range(seen, seen.colour) is not None
+    level = replace(seen, z=np.full_like(seen.z, 1.0))
+    assert lightness_over_range(level, seen.colour) is None
 
 
 def test_regions_have_as_many_points_each_and_lie_side_by_side() -> None:

@@ -18,10 +18,10 @@ from aquaflow.mapping.appearance import seen_and_clear
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.mapping.state import MapCopy, copy_map
-from aquaflow.mapping.tone import tone_of
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.medium import WaterParameters
+from aquaflow.water.tone import tone_of
 
 Picture = npt.NDArray[np.uint8]
 

@@ -51,9 +51,9 @@ from aquaflow.dive.ros.topics import (
 )
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.water.tone import ShownTone
 
 Progress = Callable[[int, int], None]
 

@@ -108,6 +108,8 @@ class MediumCurves:
     white: tuple[str, Rgb, Rgb] | None = None
     """White balance of restored pictures: name, gain on top of the camera's, and the relative 1
     sigma of that; None: the camera's."""
+    lightness: tuple[float, float] | None = None
+    """L* of the same ground, far over near: as the camera saw it, and restored."""
 
 
 @dataclass(frozen=True)

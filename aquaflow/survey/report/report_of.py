@@ -106,9 +106,14 @@ def _medium(dive: Dive) -> MediumCurves | None:
         )  # fmt: skip
         span = float(content["range_p5"]), float(content["range_p95"])
         white = _white(content.get("restored"))
+        light = content.get("lightness_over_range")
+        lightness = None if light is None else (float(light["seen"]), float(light["restored"]))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{dive.file(MEDIUM)} is damaged; map the dive again") from error
-    return MediumCurves(beta, b, B_inf, B_res, d, *span, unit=dive.frame.unit, white=white)
+    return MediumCurves(
+        beta, b, B_inf, B_res, d, *span,
+        unit=dive.frame.unit, white=white, lightness=lightness,
+    )  # fmt: skip
 
 
 def _white(restored: Any) -> tuple[str, Rgb, Rgb] | None:

@@ -370,7 +370,7 @@ def water(data: MediumCurves | None) -> str:
         + "</tr>"
         for name, *values in water_rows(data)
     )
-    seen = visibility_words(data)
+    seen = visibility_words(data) + lightness_words(data)
     return _survey_section(
         "The water in numbers", said, f'<table>{head}{body}</table><p class="after">{seen}</p>'
     )
@@ -411,6 +411,17 @@ def visibility_words(data: MediumCurves) -> str:
     said = f"Visibility: {found:.2g} {data.unit}; this dive looked {looked} far."
     beyond = " It is extrapolated from what was looked at." if found > 2.0 * data.range_p95 else ""
     return html.escape(said + beyond)
+
+
+def lightness_words(data: MediumCurves) -> str:
+    """How light the same ground is from far, in a sentence; none where too little was seen so."""
+    if data.lightness is None:
+        return ""
+    seen, restored = data.lightness
+    return (
+        f" Ground seen from near and far is {seen:.0%} as light (CIELAB L*) from far as the camera "
+        f"saw it, {restored:.0%} without the water."
+    )
 
 
 def left_out(rows: Sequence[LeftOut]) -> str:

@@ -28,7 +28,7 @@ class SeenWater:
     range: float
     """From which most of the map was seen: a browser looks through that much water at most."""
     compression: float
-    """Of highlights in the colours without water, see :class:`aquaflow.mapping.tone.ShownTone`."""
+    """Of highlights in the colours without water, see :class:`aquaflow.water.tone.ShownTone`."""
     white: RGB
     """Gain on top of ``gain`` in which a browser shows them: 1 but where another white balance was
     chosen since."""

@@ -101,6 +101,10 @@ def test_the_water_is_in_numbers_of_a_unit_that_is_said() -> None:
     assert rows["half of the light is lost over, m"][1] == "3.47"
     assert "Visibility: 15 m" in survey_sections.visibility_words(WATER)
     assert "extrapolated" in survey_sections.visibility_words(WATER)
+    assert survey_sections.lightness_words(WATER) == ""
+    far = replace(WATER, lightness=(0.834, 1.012))
+    assert "83% as light" in survey_sections.lightness_words(far)
+    assert "101% without the water" in survey_sections.lightness_words(far)
     in_units = replace(WATER, unit="map units")
     assert "attenuation of the scene's light, 1/map unit" in {
         row[0] for row in survey_sections.water_rows(in_units)

@@ -9,9 +9,9 @@ import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.state import MapCopy
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.live_viewer import pack_for_browser
+from aquaflow.water.tone import ShownTone
 
 
 def copied(count: int) -> MapCopy:

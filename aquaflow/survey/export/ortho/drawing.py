@@ -20,11 +20,11 @@ from aquaflow.dive.map_file import splats_of
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
-from aquaflow.mapping.tone import ShownTone
 from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
 from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground
+from aquaflow.water.tone import ShownTone
 
 Array = npt.NDArray[np.float64]
 

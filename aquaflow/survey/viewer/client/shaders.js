@@ -27,7 +27,7 @@ mat3 rotation(vec4 q) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// Highlights drawn together, or with -c apart again (aquaflow/mapping/tone.py).
+// Highlights drawn together, or with -c apart again (aquaflow/water/tone.py).
 vec3 toned(vec3 bright, float c) {
   vec3 above = max(bright - 0.8, 0.0);
   return min(bright, 0.8) + above / max(1.0 + c * above, 0.02);

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.mapping.tone import ShownTone, lightness, tone_of
+from aquaflow.water.tone import ShownTone, lightness, tone_of
 
 
 def test_a_dive_that_is_light_enough_without_water_is_shown_as_it_is() -> None:
