@@ -9,6 +9,8 @@ import numpy.typing as npt
 from aquaflow.prior.contract import Keypoints, Mask
 from aquaflow.prior.flow import Float, Grey, pixel_grid
 
+Index = npt.NDArray[np.int64]
+
 SIFT_FEATURES = 2000
 """Strongest keypoints of a picture that are kept."""
 SIFT_CONTRAST = 0.015
@@ -38,17 +40,31 @@ def detect(
     return Keypoints(pixels, np.asarray(descriptors, dtype=np.float32))
 
 
+def clear_matches(a: Keypoints, b: Keypoints) -> tuple[Index, Index]:
+    """Indices [M] into a and into b, which has two at least: the nearest descriptor of b to each of
+    a, where it is clearly nearer than the second."""
+    # |x - y|^2 = |x|^2 - 2 x . y + |y|^2, of SIFT in whole numbers that float32 holds exactly. One
+    # product of matrices takes a third of the time of OpenCV's matcher.
+    product = a.descriptors @ b.descriptors.T
+    product *= -2.0
+    product += (b.descriptors**2).sum(1)
+    rows, nearest = np.arange(len(product)), product.argmin(1)
+    own = (a.descriptors**2).sum(1)
+    best = np.maximum(own + product[rows, nearest], 0.0)
+    product[rows, nearest] = np.inf
+    second = np.maximum(own + product.min(1), 0.0)
+    clear = np.flatnonzero(best < LOWE_RATIO**2 * second)
+    return clear, nearest[clear]
+
+
 def homography(a: Keypoints, b: Keypoints) -> npt.NDArray[np.float64] | None:
     """[3, 3] map from pixels of a to pixels of b, or None where the pictures do not match."""
     if len(a.pixels) < MIN_INLIERS or len(b.pixels) < MIN_INLIERS:
         return None
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.descriptors, b.descriptors, 2)
-    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < LOWE_RATIO * p[1].distance]
-    if len(good) < MIN_INLIERS:
+    mine, theirs = clear_matches(a, b)
+    if len(mine) < MIN_INLIERS:
         return None
-    source = a.pixels[[match.queryIdx for match in good]]
-    target = b.pixels[[match.trainIdx for match in good]]
-    H, inliers = cv2.findHomography(source, target, cv2.USAC_MAGSAC, RANSAC_PX)
+    H, inliers = cv2.findHomography(a.pixels[mine], b.pixels[theirs], cv2.USAC_MAGSAC, RANSAC_PX)
     if H is None or inliers is None or int(inliers.sum()) < MIN_INLIERS:
         return None
     return np.asarray(H, dtype=np.float64)

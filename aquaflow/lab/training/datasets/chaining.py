@@ -12,7 +12,7 @@ import numpy as np
 from aquaflow.lab.training.datasets.posed import Array, Frames, Posed
 from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow import normalised_grey
-from aquaflow.prior.homography import LOWE_RATIO, detect
+from aquaflow.prior.homography import clear_matches, detect
 
 RANSAC_PX = 2.0
 """Reprojection error up to which a keypoint agrees with a pose."""
@@ -71,12 +71,10 @@ def _matches(a: tuple[Posed, Keypoints], b: tuple[Posed, Keypoints]) -> tuple[Ar
     none = np.zeros((0, 3)), np.zeros((0, 2))
     if min(len(mine.pixels), len(theirs.pixels)) < MIN_INLIERS:
         return none
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(mine.descriptors, theirs.descriptors, 2)
-    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < LOWE_RATIO * p[1].distance]
-    if not good:
+    in_a, in_b = clear_matches(mine, theirs)
+    if len(in_a) == 0:
         return none
-    here = mine.pixels[[match.queryIdx for match in good]].astype(np.float64)
-    there = theirs.pixels[[match.trainIdx for match in good]].astype(np.float64)
+    here, there = mine.pixels[in_a].astype(np.float64), theirs.pixels[in_b].astype(np.float64)
     column, row = np.floor(here).astype(np.int64).T
     z = view.depth[row, column].astype(np.float64)
     rays = np.column_stack([here, np.ones(len(here))]) @ np.linalg.inv(view.K).T
