@@ -40,9 +40,11 @@ setup: $(INSTALLED) ## Make .venv and install AquaFlow with the tested versions.
 
 $(INSTALLED): pyproject.toml constraints.txt setup.py $(KERNELS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	# Most of these 15,000 modules are never imported: only what commands need is compiled now.
+	$(BIN)/pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
 	# Its signatures are tested on every machine; what it asks for would bring a compiler.
-	$(BIN)/pip install --quiet -c constraints.txt --no-deps gsplat
+	$(BIN)/pip install --quiet --no-compile -c constraints.txt --no-deps gsplat
+	$(BIN)/python tests/command_server.py </dev/null
 	@touch $@
 
 ifdef CLIP

@@ -7,6 +7,8 @@ compiler the install succeeds and says so.
 from __future__ import annotations
 
 import importlib.util
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -44,6 +46,14 @@ def kernel_isas() -> tuple[str, ...]:
     return () if compiler is None else native.target_isas(compiler)
 
 
+def build_kernel(isa: str, out_dir: Path) -> str:
+    """Compile one variant; what became of it."""
+    try:
+        return f"aquaflow: built {native.build(isa, out_dir)}"
+    except native.BuildError as error:
+        return f"aquaflow: no {isa} renderer: {error}"
+
+
 class BuildWithKernels(build_py):
     """Copies the Python files, then compiles every variant of the compiler's architecture."""
 
@@ -53,11 +63,9 @@ class BuildWithKernels(build_py):
         if not self.editable_mode:
             for copied in out_dir.glob("*.so"):
                 copied.unlink()  # from the sources' folder: of another day or architecture
-        for isa in kernel_isas():
-            try:
-                print(f"aquaflow: built {native.build(isa, out_dir)}")
-            except native.BuildError as error:
-                print(f"aquaflow: no {isa} renderer: {error}")
+        with ThreadPoolExecutor() as pool:  # each waits for a compiler of its own
+            for said in pool.map(partial(build_kernel, out_dir=out_dir), kernel_isas()):
+                print(said)
         if not list(out_dir.glob("*.so")):
             print("aquaflow: no compiled renderer; the much slower torch renderer will be used")
 
