@@ -41,7 +41,11 @@ def slow_pool(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings(mask_overlays: bool = True) -> Config:
-    tracking = {"mask_overlays": mask_overlays, "gate": {"skip_duplicates": False}}
+    tracking = {
+        "mask_overlays": mask_overlays,
+        "gate": {"skip_duplicates": False},
+        "initialisation": {"focal_factors": [1.4]},  # one start instead of three
+    }
     return parse_config({"threads": 1, "tracking": tracking, "mapping": {"enabled": False}}, "test")
 
 
@@ -96,6 +100,8 @@ def keypoints_of_the_lens(
     find = OverlayFinder.mask
     monkeypatch.setattr(OverlayFinder, "mask", keep)
     monkeypatch.setattr(calibration_pass, "found_lens", spy)
+    # One pass that poses a part of the frames is enough.
+    monkeypatch.setattr(calibration_pass, "REPEAT_OUTSIDE_SHARE", 1.0)
     recording = open_recording(pool / "images")
     calibration_pass.found_in(recording, config, lambda done, of: None)
     recording.close()
