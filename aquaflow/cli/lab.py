@@ -48,6 +48,9 @@ def synth(
     arm: Annotated[
         bool, typer.Option("--arm", help="The vehicle's arm is in the picture.")
     ] = False,
+    lamps: Annotated[
+        float | None, typer.Option(help="Lamps by the camera; the share of daylight, 0 to 1.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write a synthetic dive with its ground truth."""
@@ -59,6 +62,7 @@ def synth(
     asked = {
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
         "seed": seed, "display": display, "fish": fish, "arm": arm,
+        "lamps": None if lamps is None else {"ambient": lamps},
     }  # fmt: skip
     try:
         config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})

@@ -53,6 +53,17 @@ class Medium:
         red, green, blue = self.beta_a
         return replace(self, beta_a=(factor * red, factor * green, factor * blue))
 
+    def under(
+        self,
+        light: float,  # over that of before
+    ) -> Medium:
+        """The same water by less or more daylight."""
+        B_inf, B_res = (
+            (light * red, light * green, light * blue)
+            for red, green, blue in (self.B_inf, self.B_res)
+        )
+        return replace(self, B_inf=B_inf, B_res=B_res)
+
     def transmission(
         self,
         z: FloatArray,  # [...]

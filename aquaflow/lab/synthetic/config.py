@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -43,9 +44,52 @@ class Bleached(BaseModel):
     )
 
 
+# --------------------------------------------------------------------------------------------------
+# Light that the vehicle brings along.
+
+
+class Lamps(BaseModel):
+    """Lamps beside the camera that shine where it looks (lamps.py)."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    ambient: float = Field(
+        0.3, ge=0.0, le=1.0, description="daylight over that of a dive without lamps; 0: night"
+    )
+    even_m: float = Field(
+        2.5,
+        gt=0.1,
+        le=10.0,
+        description="m, where lamps and daylight together are as bright as a dive's daylight "
+        "without lamps, on a surface that faces the lamps, through no water",
+    )
+    places_m: tuple[tuple[float, float, float], ...] = Field(
+        ((-0.2, -0.1, 0.0), (0.2, -0.1, 0.0)),
+        min_length=1,
+        description="m right, down, forward of the camera; judgement: two lamps at the sides of a "
+        "BlueROV2's frame",
+    )
+    half_angle_deg: float = Field(
+        67.5,
+        ge=10.0,
+        lt=90.0,
+        description="degrees off the axis where a lamp is half as bright; the Lumen light of a "
+        "BlueROV2 is sold with a beam of 135 degrees in water",
+    )
+    colour: tuple[float, float, float] = Field(
+        (1.0, 1.0, 1.0), description="of the lamps where daylight is white, RGB"
+    )
+
+    @property
+    def cosine_power(self) -> float:
+        """Power of the cosine by which the intensity falls off the axis."""
+        return math.log(0.5) / math.log(math.cos(math.radians(self.half_angle_deg)))
+
+
 __all__ = [
     "FACED",
     "Display",
+    "Lamps",
     "SceneKind",
     "SyntheticConfig",
     "TelemetryNoise",
@@ -214,6 +258,7 @@ class SyntheticConfig(BaseModel):
     vignette: float = Field(
         0.2, ge=0, lt=1, description="fraction of light that is missing in the corners"
     )
+    lamps: Lamps | None = Field(None, description="of the vehicle; None: daylight alone")
     noise_sigma: float = Field(
         0.005, ge=0, le=0.2, description="sensor noise, of full scale; 1.3 grey levels"
     )

@@ -103,7 +103,8 @@ def write_dive(
 def _write_tables(out: Path, config: SyntheticConfig, site: SurveySite) -> None:
     t, path = np.arange(config.frames) / config.fps, site.path
     save_camera(camera_of(config), out / "camera.yaml")
-    save_medium(WATER_TYPES[config.water], out / "medium.yaml")
+    water, lamps = WATER_TYPES[config.water], config.lamps
+    save_medium(water if lamps is None else water.under(lamps.ambient), out / "medium.yaml")
     (out / "timestamps.txt").write_text("".join(f"{value:.9f}\n" for value in t))
     xyzw = Rotation.from_matrix(path.R_wc(t)).as_quat(canonical=True)
     rows = np.column_stack([path.centre_w(t), xyzw]).tolist()
@@ -169,10 +170,18 @@ def _write_pictures(
         for k in range(config.frames):
             medium = mean.looking(R_wc[k, :, 2], config.directional_attenuation)
             view = render.render(
-                scene, camera, R_sc[k], centres[k], medium, config.supersampling, bodies.at(k)
+                scene,
+                camera,
+                R_sc[k],
+                centres[k],
+                medium,
+                config.supersampling,
+                bodies.at(k),
+                config.lamps,
             )
             water = view.water.copy()
-            snow.draw(water, view.range_m, camera, R_sc[k], centres[k], float(t[k]), medium)
+            pose = R_sc[k], centres[k], float(t[k])
+            snow.draw(water, view.range_m, camera, *pose, medium, config.lamps)
             picture = expose(water * light, shade, config.noise_sigma, noise_rng)
             if config.display is not None:
                 burn_in(picture, config.display, float(t[k]))

@@ -74,6 +74,18 @@ class RayHeightField:
         """Height [N] at positions x, y [N]."""
         return self._sample(self._height, x, y)[0]
 
+    def normals(
+        self,
+        x: torch.Tensor,  # [N] m
+        y: torch.Tensor,  # [N] m
+    ) -> torch.Tensor:
+        """[3, N] unit, up, at positions x, y [N]."""
+        step = self._cell
+        rise_x = self.height(x - step, y) - self.height(x + step, y)
+        rise_y = self.height(x, y - step) - self.height(x, y + step)
+        up = torch.stack([rise_x, rise_y, torch.full_like(x, 2.0 * step)])
+        return functional.normalize(up, dim=0)
+
     def bundle_start(
         self,
         origin: torch.Tensor,  # [3], or [3, N] of each ray

@@ -206,6 +206,18 @@ def radiance(
     return ((paint + grown * (growth - paint)) * light).clamp(0.004, 0.98)
 
 
+def normals(
+    shape: Solid,
+    origin: torch.Tensor,  # [3] m, or [3, N] of each ray
+    rays: torch.Tensor,  # [3, N]
+    t: torch.Tensor,  # [N] m, where they hit
+) -> torch.Tensor:
+    """[3, N] unit, outward, where ``rays`` meet ``shape``."""
+    o, d = _local(shape, origin, rays)
+    normal, _, _ = _surface(shape, o.reshape(3, -1) + t * d)
+    return _turn(torch.tensor(shape.R, dtype=torch.float32), normal)
+
+
 def _surface(
     shape: Solid,
     p: torch.Tensor,  # [3, N] m

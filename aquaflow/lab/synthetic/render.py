@@ -16,6 +16,8 @@ import torch
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import rays_of_pixels
 from aquaflow.lab.synthetic import objects
+from aquaflow.lab.synthetic.config import Lamps
+from aquaflow.lab.synthetic.lamps import LampLight
 from aquaflow.lab.synthetic.march import RayHeightField
 from aquaflow.lab.synthetic.radiance import TEXELS_PER_CELL
 from aquaflow.lab.synthetic.relief import Area
@@ -23,6 +25,8 @@ from aquaflow.lab.synthetic.texture import MipAtlas
 from aquaflow.lab.synthetic.water import Medium
 
 Array: TypeAlias = npt.NDArray[np.float64]
+Met: TypeAlias = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+"""Origins [3] or [3, N], rays [3, N], their ranges [N] and what they hit [N] (-1 floor)."""
 
 BUNDLE = 4
 """Rays along the side of a bundle in the first pass."""
@@ -66,6 +70,7 @@ def render(
     medium: Medium,
     supersampling: int,
     bodies: Sequence[objects.Solid] = (),
+    lamps: Lamps | None = None,
 ) -> RenderedView:
     """Render with ``supersampling`` x ``supersampling`` rays per pixel; ``bodies`` move by
     themselves, and are where they are now."""
@@ -84,9 +89,15 @@ def render(
 
     def draw(top: int) -> None:
         part = slice(top, min(top + rows, height))
-        t, what, J = _trace(scene, camera, rotation, origin, part, supersampling)
+        met = _ranges(scene, camera, rotation, origin, part, supersampling)
+        J = _trace(scene, camera, met, part, supersampling)
         view.clean[part] = _pixel_mean(J, supersampling)
-        colours = medium.compose(J, t.reshape(J.shape[:2]).numpy())
+        t, what = met[2:]
+        if lamps is None:
+            colours = medium.compose(J, t.reshape(J.shape[:2]).numpy())
+        else:
+            light = LampLight.of_camera(lamps, medium, rotation, origin.numpy())
+            colours = _lit(scene, light, met, J)
         view.water[part] = _pixel_mean(colours, supersampling)
         if supersampling > 1:
             t, what = _ranges(scene, camera, rotation, origin, part, 1)[2:]
@@ -144,11 +155,8 @@ def _ranges(
     centre: torch.Tensor,  # [3] m
     part: slice,
     k: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Origins [3] or [3, N], rays [3, N], their ranges [N] and what they hit [N] (-1 floor).
-
-    There are k x k rays a pixel.
-    """
+) -> Met:
+    """What k x k rays a pixel meet."""
     rows = part.start + (np.arange((part.stop - part.start) * k) + 0.5) / k
     columns = (np.arange(camera.width * k) + 0.5) / k
     origin, rays = _rays(camera, rotation, centre, rows, columns)
@@ -190,14 +198,12 @@ def _may_meet(
 def _trace(
     scene: SyntheticScene,
     camera: CameraModel,
-    rotation: Array,  # [3, 3]
-    centre: torch.Tensor,  # [3] m
+    met: Met,
     part: slice,
     k: int,
-) -> tuple[torch.Tensor, torch.Tensor, npt.NDArray[np.float32]]:
-    """Ranges [N] of all rays of some rows, what they hit [N], and their clean radiances
-    [k R, k W, 3]."""
-    origin, rays, t, what = _ranges(scene, camera, rotation, centre, part, k)
+) -> npt.NDArray[np.float32]:
+    """Clean radiances [k R, k W, 3] of all rays of some rows."""
+    origin, rays, t, what = met
     pixel = 1.0 / (camera.fx * k)
     shape = ((part.stop - part.start) * k, camera.width * k)
     near = torch.where(t.isfinite(), t, 0.0)
@@ -222,7 +228,27 @@ def _trace(
             pixel,
         )
     J = torch.where(t.isfinite(), J.clamp_max(0.98), 0.0)
-    return t, what, J.reshape(3, *shape).permute(1, 2, 0).numpy()
+    return J.reshape(3, *shape).permute(1, 2, 0).numpy()
+
+
+def _lit(
+    scene: SyntheticScene,
+    light: LampLight,
+    met: Met,
+    J: npt.NDArray[np.float32],  # [k R, k W, 3]
+) -> npt.NDArray[np.floating]:
+    """[k R, k W, 3] what the rays see by daylight and lamps."""
+    origin, rays, t, what = met
+    near = torch.where(t.isfinite(), t, 0.0)
+    normals = scene.field.normals(origin[0] + near * rays[0], origin[1] + near * rays[1])
+    for index in np.unique(what.numpy()).tolist():
+        if index >= 0:
+            which = (what == index).nonzero()[:, 0]
+            on = _pick(origin, which), rays[:, which], t[which]
+            normals[:, which] = objects.normals(scene.shapes[index], *on)
+    start = origin.mT.numpy() if origin.dim() > 1 else origin.numpy()
+    seen = light.compose(J.reshape(-1, 3), start, rays.T.numpy(), t.numpy(), normals.T.numpy())
+    return seen.reshape(J.shape)
 
 
 def _pick(

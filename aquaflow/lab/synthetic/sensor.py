@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import pixels_of_points
-from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.config import Lamps, SyntheticConfig
+from aquaflow.lab.synthetic.lamps import LampLight
 from aquaflow.lab.synthetic.water import Medium
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -51,8 +52,12 @@ class Snow:
         centre: Array,  # [3] m
         t_s: float,
         medium: Medium,
+        lamps: Lamps | None = None,
     ) -> None:
         """Blend the particles that are in view over ``image``."""
+        light = (
+            None if lamps is None else LampLight.of_camera(lamps, medium, np.eye(3), np.zeros(3))
+        )
         local = (self._position + CURRENT_M_S * t_s - centre) @ R_sc
         distance = np.linalg.norm(local, axis=1)
         seen = (local[:, 2] > 0.0) & (distance > SNOW_RANGE_M[0]) & (distance < SNOW_RANGE_M[1])
@@ -61,7 +66,8 @@ class Snow:
         size = np.array([camera.width, camera.height])
         seen &= ((pixels > -4.0) & (pixels < size + 4.0)).all(axis=1)
         for k in np.flatnonzero(seen).tolist():
-            self._blend(image, range_m, pixels[k], float(distance[k]), k, camera, medium)
+            colour = _lit(local[k], float(distance[k]), medium, light)
+            self._blend(image, range_m, pixels[k], float(distance[k]), k, camera, colour)
 
     def _blend(
         self,
@@ -71,7 +77,7 @@ class Snow:
         distance: float,
         k: int,
         camera: CameraModel,
-        medium: Medium,
+        colour: Array,  # [3] as it reaches the camera
     ) -> None:
         radius = camera.fx * self._radius[k] / distance
         # Out of focus when near: the blur disc grows with 1 / distance.
@@ -88,9 +94,22 @@ class Snow:
         # The light of the disc, spread over the blur.
         opacity = fall * min(0.9, radius**2 / (2.0 * sigma**2))
         opacity = opacity * (range_m[y0:y1, x0:x1] > distance)
-        colour = medium.compose(np.full(3, SNOW_ALBEDO)[None], np.array([distance]))[0]
         window = image[y0:y1, x0:x1]
         window += (opacity[..., None] * (colour - window)).astype(np.float32)
+
+
+def _lit(
+    place: Array,  # [3] m, camera axes
+    distance: float,
+    medium: Medium,
+    light: LampLight | None,  # in camera axes
+) -> Array:
+    """[3] a particle as it reaches the camera."""
+    J, t = np.full((1, 3), SNOW_ALBEDO), np.array([distance])
+    if light is None:
+        return np.asarray(medium.compose(J, t)[0])
+    ray = place[None] / distance
+    return np.asarray(light.compose(J, np.zeros(3), ray, t, -ray)[0])
 
 
 def vignette(camera: CameraModel, strength: float) -> Image:

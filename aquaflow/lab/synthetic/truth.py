@@ -3,7 +3,8 @@
 The folder of a dive:
 
 - ``images/000000.png``: the pictures, 8 bit RGB, linear radiance;
-- ``clean/000000.png``: the same without water, snow, vignette and noise (J), 8 bit, linear;
+- ``clean/000000.png``: the same in full daylight without water, snow, vignette and noise (J), 8
+  bit, linear;
 - ``range/000000.npz``: ``range_m`` float32 [H, W] along the ray of each pixel's centre (0 where
   nothing is hit) and ``hit`` bool [H, W]; ``moving`` bool [H, W] where fish or an arm are seen, if
   any are;
