@@ -45,6 +45,10 @@ SIDE, REACH = 5, 2.0
 """Samples along a side of the patch's grid, and how many sigmas it reaches to each side."""
 SEEN_SHARE = 0.85
 """Of a patch's samples that a view must show."""
+CLIPPED = 0.9
+"""A sample that is brighter in any channel has clipped pixels; its patch is no observation there.
+Taken at its word, what is near looks darker than it is: the errors of a rendered dive with lamps
+were three times as large."""
 LEAST_TEXTURE = 0.008
 """Deviation of a patch's samples in the nearest of its views, two grey levels. Where there is less,
 nothing is known of the range: open water, which a map has anywhere."""
@@ -150,7 +154,8 @@ def _observe(
     colour = np.einsum("k,nkc->nc", weight, colours)
     size = np.array([picture.camera.width, picture.camera.height])
     xy = np.einsum("k,nkc->nc", weight, pixels) / (0.5 * size) - 1.0
-    return colour, z[:, None], xy, seen.mean(axis=1) > SEEN_SHARE
+    whole = (seen.mean(axis=1) > SEEN_SHARE) & (colours.max(axis=(1, 2), initial=0.0) < CLIPPED)
+    return colour, z[:, None], xy, whole
 
 
 def _aperture(

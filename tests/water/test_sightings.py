@@ -99,6 +99,15 @@ def test_where_the_map_has_nothing_there_are_no_patches() -> None:
     assert looked([wall_picture(centre, alpha=0.2) for centre in BACKING]).points == 0
 
 
+def test_where_pixels_are_clipped_there_is_no_observation() -> None:
+    pictures = [wall_picture(centre) for centre in BACKING]
+    bright = np.array(pictures[0].half_size()).repeat(2, axis=0).repeat(2, axis=1) * 255.0 * 1.6
+    pictures[0] = wall_picture(BACKING[0], np.rint(bright.clip(0.0, 255.0)).astype(np.uint8))
+    seen = looked(pictures)
+    assert (seen.view == 0).any()
+    assert seen.colour.max() < sightings.CLIPPED
+
+
 def test_open_water_without_texture_is_no_surface() -> None:
     blue = np.full((120, 160, 3), (20, 60, 120), np.uint8)
     assert looked([wall_picture(centre, colours=blue) for centre in BACKING]).points == 0
