@@ -210,6 +210,7 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),
         mapper.scene.unevenness().tolist(),
+        mapper.scene.lamp,
         tone.exposure,
         tone.compression,
     )
@@ -242,4 +243,4 @@ def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
 def water_of(summary: WaterSummary, device: torch.device = CPU) -> WaterParameters:
     """The summary as tensors."""
     fields = (summary.beta_a, summary.B_inf, summary.b, summary.B_res, summary.d)
-    return WaterParameters(*(water_in(values, device) for values in fields))
+    return WaterParameters(*(water_in(values, device) for values in fields), lamp=summary.lamp)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped
+from aquaflow.water.model import Lamp
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "
@@ -65,6 +66,8 @@ class WaterSummary:
     """Log-gain of the camera over the picture: x, y, x^2, x y, y^2 with x, y from -1 to 1."""
     unevenness: list[float]
     """Log-gain of the backscatter over the picture, in the same terms."""
+    lamp: Lamp | None
+    """Light from beside the camera; None where none was found."""
     exposure: float
     """One gain of all that is restored, on top of ``white_gain``."""
     highlight_compression: float
@@ -206,6 +209,7 @@ def medium_json(
         and dict(zip(("seen", "restored"), water.range_variance, strict=True)),
         "lightness_over_range": water.lightness_over_range
         and dict(zip(("seen", "restored"), water.lightness_over_range, strict=True)),
+        "lamp": water.lamp and asdict(water.lamp),
         "shading_log_gain": water.shading,
         "backscatter_log_gain": water.unevenness,
         "log_gain_terms": ["x", "y", "x^2", "x y", "y^2"],

@@ -160,7 +160,7 @@ def mean_water(scene: Scene, views: Sequence[View]) -> WaterParameters | None:
     if not scene.medium.active or not views:
         return None
     with torch.no_grad():
-        water: WaterParameters = scene.medium(orientations(views, scene.device))
+        water = scene.waters(orientations(views, scene.device))
         return replace(water, beta_a=water.beta_a.mean(dim=0))
 
 

@@ -21,7 +21,7 @@ from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
 from aquaflow.water.exposure import gain_of, learn_gain
 from aquaflow.water.medium import LearnedMedium, WaterParameters
-from aquaflow.water.model import TERMS, gain_map
+from aquaflow.water.model import TERMS, Lamp, gain_map
 from aquaflow.water.nearest import Nearest
 from aquaflow.water.open_sightings import light_of_ground, open_water
 from aquaflow.water.sightings import SOLID
@@ -50,6 +50,8 @@ class Scene:
         self.medium = weights_in(LearnedMedium(config, generator), self.device)
         self.shading = np.zeros(TERMS)
         """Coefficients of the log-gain over the picture."""
+        self.lamp: Lamp | None = None
+        """Light from beside the camera; None where the last fit found none."""
         self.exposes = False
         """True once the observations showed that some views are brighter than others."""
         self.sunlight = Sunlight(sunlight or SunlightConfig())
@@ -72,7 +74,15 @@ class Scene:
         """The medium for this view, or None while it is switched off."""
         if not self.medium.active:
             return None
-        return self.medium(orientations([view], self.device)[0])  # type: ignore[no-any-return]
+        return self.waters(orientations([view], self.device)[0])
+
+    def waters(
+        self,
+        R_wc: Tensor,  # [3, 3] or [V, 3, 3] camera to world
+    ) -> WaterParameters:
+        """The medium, and the lamp, of cameras with this orientation."""
+        water: WaterParameters = self.medium(R_wc)
+        return replace(water, lamp=self.lamp)
 
     def centre_water(self, views: Sequence[View]) -> None:
         """Let the attenuation of ``views`` be on the mean that which the water fit found."""
@@ -342,12 +352,13 @@ def show(
         view.camera.height,
         active,
     )
-    clean = drawn.image[..., :3]
+    clean, seen = drawn.image[..., :3], drawn.image
+    if water is not None and water.lamp is not None:
+        z = seen[..., 3].detach() / drawn.alpha.detach().clamp_min(MIN_SOLID)
+        seen = torch.cat([clean * water.light(water.lamp, z), seen[..., 3:]], dim=-1)
     if water is None:
         z = drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
         image = clean if gain is None else clean * gain[..., None]
     else:
-        image, z = compose_water(
-            drawn.image, drawn.alpha, water.stack(), renderer.threads, uneven, gain
-        )
+        image, z = compose_water(seen, drawn.alpha, water.stack(), renderer.threads, uneven, gain)
     return RenderedMap(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)

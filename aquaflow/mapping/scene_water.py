@@ -120,9 +120,11 @@ def _adopt(
     old_gains = torch.stack([gain_of(view) for view in fitted])
     scene.medium.active = estimate.model.water
     if estimate.model.water:
-        found = (estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness)
+        found = [estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness]
+        found += [] if estimate.lamp is None else [estimate.glow]
         scene.medium.set_water(*(water_in(v, scene.device) for v in found))
         scene.centre_water(fitted)
+    scene.lamp = estimate.lamp
     scene.shading, scene.exposes = estimate.shading, estimate.model.exposure
     scene.beta_a_sigma, scene.water_evidence = estimate.beta_a_sigma, estimate.evidence
     scene.balance, scene.range_variance = _as_chosen(scene, estimate), estimate.range_variance
@@ -158,7 +160,7 @@ def _water_of(
     which: torch.Tensor,  # [N] int64
 ) -> WaterParameters:
     """The water for N points, each seen from its own view: beta_a is [N, 3]."""
-    water: WaterParameters = scene.medium(orientations(views, scene.device))
+    water = scene.waters(orientations(views, scene.device))
     return replace(water, beta_a=water.beta_a[which])
 
 

@@ -40,6 +40,7 @@ from aquaflow.render.dense_adam import STEP, DenseAdam
 from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
 from aquaflow.water.exposure import log_gains_of, set_log_gain
+from aquaflow.water.model import Lamp
 from aquaflow.water.sightings import SOLID
 from aquaflow.water.tone import ShownTone, tone_of
 from aquaflow.water.white_balance import ChosenWhite, WhiteBalance
@@ -62,6 +63,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "sunlight_plays": scene.sunlight.plays,
         "water_evidence": scene.water_evidence,
         "beta_a_sigma": scene.beta_a_sigma,
+        "lamp": None if scene.lamp is None else asdict(scene.lamp),
         **_white_facts(scene.balance),
         "tone": None if mapper.tone is None else [mapper.tone[0], asdict(mapper.tone[1])],
         "range_variance": scene.range_variance,
@@ -123,6 +125,8 @@ def deserialise(
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
+    if facts.get("lamp") is not None:  # not in maps written before 2026-11-26
+        scene.lamp = Lamp(**facts["lamp"])
     if "gain" in (facts.get("white_balance") or {}):  # not in maps written before 2026-11-22
         chosen = ChosenWhite(**facts.get("chosen_white", {}))  # not before 2026-11-27
         scene.balance = WhiteBalance(**facts["white_balance"], chosen=chosen)

@@ -7,9 +7,10 @@ can follow its error.
 
 Lamps and lenses darken the picture towards its edge, and near ground is seen near the edge: left
 out, that looks like water. So does light that changes while the vehicle climbs. Sunlit water shines
-more brightly the less one looks down. And in air or clear water there is nothing to find at all.
-Which of the four are there is decided by the models' marginal likelihoods (Laplace's method) under
-stated priors, with errors that neighbours share counted once.
+more brightly the less one looks down. Lamps beside the camera light what is near, and what fades
+with their light is not all water. And in air or clear water there is nothing to find at all. Which
+of these are there is decided by the models' marginal likelihoods (Laplace's method) under stated
+priors, with errors that neighbours share counted once.
 
 A dive is in water unless there is evidence for clear water, and the likeliest water would not
 show. Where little can be seen of it, the usual water is taken, with its uncertainty.
@@ -32,6 +33,7 @@ from aquaflow.water.model import (
     BELIEVED,
     RATE_ROWS,
     Derivatives,
+    Lamp,
     Model,
     Prediction,
     WaterModel,
@@ -58,10 +60,14 @@ NEGLIGIBLE_DEPTH = 0.06
 VISIBLE_DEPTH = 0.12
 """Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
 scenes without water look like 0.02 to 0.05."""
+LAMP_SHOWS = 20.0
+"""Log odds for a lamp from which it is taken as seen: below 5 on rendered dives by daylight and the
+shared clips, 200 to 700 on ten rendered dives with lamps."""
 EVERY_MODEL = tuple(
     Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible
 )
-"""With and without each part. Shading and unevenness together only where open water is seen."""
+"""With and without each part but lamps, which are looked for in what is found (``with_lamp``).
+Shading and unevenness together only where open water is seen."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,9 @@ class WaterEstimate:
     """[3]"""
     b: Array
     """[3]"""
+    lamp: Lamp | None
+    glow: Array
+    """[3] of the lamp's light that the water returns, as from any range; 0 without a lamp."""
     unevenness: Array
     """[5] coefficients of the backscatter's log-gain over the picture."""
     beta_a_sigma: list[float] | None
@@ -140,11 +149,13 @@ def estimating(
     if wet is None or (odds is not None and _is_clear(wet, odds)):
         assert dry is not None
         return (yield from _estimate(observations, dry, odds))
+    wet = yield from _lamplit(wet, problems(observations, with_lamp(some)))
     yield
     found = wet.prediction
     extended = yield from with_open_water(observations, pictures, found.trial, found.J.mean(axis=1))
     if extended.points > observations.points:
         wet_models = [model for model in models if model.water]
+        wet_models = with_lamp(wet_models) if wet.problem.model.lamp else wet_models
         (wet,) = yield from fit_likeliest(problems(extended, wet_models))
     return (yield from _estimate(observations, wet, odds, pictures))
 
@@ -173,6 +184,8 @@ def _estimate(
         trial.beta_a,
         trial.B_inf,
         trial.b,
+        trial.lamp,
+        trial.glow,
         trial.unevenness,
         sigma,
         trial.shading,
@@ -183,6 +196,25 @@ def _estimate(
         (range_variance[0], range_variance[1]),
         lightness,
     )
+
+
+def with_lamp(models: Sequence[Model]) -> list[Model]:
+    """The same with a lamp, of those in water; most backscatter is the lamp's then, and even."""
+    return [replace(model, lamp=True) for model in models if model.water and not model.uneven]
+
+
+def _lamplit(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[None, None, WaterFit]:
+    """The likeliest of the problems, all with a lamp, if that is far likelier than ``wet``."""
+    if not problems:
+        return wet
+    richest = max(problems, key=lambda problem: problem.size)
+    first = yield from descend(richest, richest.start, wet.noise)
+    if first.log_evidence < wet.log_evidence:
+        return wet
+    (lit,) = yield from fit_likeliest(problems)
+    # Evidence is comparable at one noise only: that of the better fit.
+    dark = yield from descend(wet.problem, wet.x, lit.noise)
+    return lit if lit.log_evidence - dark.log_evidence > LAMP_SHOWS else wet
 
 
 def _is_clear(wet: WaterFit, odds: float) -> bool:

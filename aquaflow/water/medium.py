@@ -18,12 +18,14 @@ from torch import Tensor, nn
 
 from aquaflow.config import MediumConfig
 from aquaflow.render.water import BANDS, MAX_OPTICAL_DEPTH, sinusoidal_encoding
-from aquaflow.water.model import TERMS
+from aquaflow.water.model import NEAREST_LIT, TERMS, Lamp
 
 MIN_RATE = 1e-4
 """1 / map unit; a rate of zero has no finite parameter."""
 B_INF_RANGE = (0.01, 0.99)
 """What the water may start from: 0 and 1 have no finite logit."""
+GLOW_RANGE = (1e-4, 0.99)
+"""The same of the residual backscatter."""
 MAX_LOG_FACTOR = 0.7
 """Log of the attenuation in one orientation over its mean; judgement: a factor of two."""
 
@@ -111,11 +113,16 @@ class LearnedMedium(nn.Module):
         B_inf: Tensor,  # [3]
         b: Tensor,  # [3]
         unevenness: Tensor | None = None,  # [5]
+        glow: Tensor | None = None,  # [3] backscatter of a lamp, as from any range
     ) -> None:
-        """Start from an estimate; the residual term and the orientation's say stay as they are."""
+        """Start from an estimate; the orientation's say stays as it is, and so does the residual
+        term unless there is a ``glow``."""
         self.output.bias.copy_(inverse_softplus(beta_a))
         self.B_inf_logit.copy_(torch.logit(B_inf.clamp(*B_INF_RANGE)))
         self.b_raw.copy_(inverse_softplus(b))
+        if glow is not None:
+            self.B_res_logit.copy_(torch.logit(glow.clamp(*GLOW_RANGE)))
+            self.d_raw.copy_(inverse_softplus(torch.zeros_like(glow)))
         self.unevenness.zero_() if unevenness is None else self.unevenness.copy_(unevenness)
 
 
@@ -161,6 +168,7 @@ class WaterParameters:
     b: Tensor
     B_res: Tensor
     d: Tensor
+    lamp: Lamp | None = None
 
     def backscatter(
         self,
@@ -175,8 +183,19 @@ class WaterParameters:
         self,
         z: Tensor,  # [...] range
     ) -> Tensor:
-        """exp(-beta_a z) [..., 3]."""
-        return torch.exp(-_optical_depth(self.beta_a, z))
+        """Share of J [..., 3] that is seen: exp(-beta_a z), times the light of a lamp."""
+        T = torch.exp(-_optical_depth(self.beta_a, z))
+        return T if self.lamp is None else T * self.light(self.lamp, z)
+
+    def light(
+        self,
+        lamp: Lamp,
+        z: Tensor,  # [...] range
+    ) -> Tensor:
+        """[..., 3] of what is seen there, over that in which J is its colour."""
+        nearer = (lamp.range / z.clamp_min(NEAREST_LIT * lamp.range)).pow(lamp.power)
+        beam = nearer[..., None] * torch.exp(-_optical_depth(self.beta_a, z))
+        return 1.0 - lamp.share + lamp.share * beam
 
     def stack(self) -> Tensor:
         """[5, 3] in the order that the fused kernel takes."""

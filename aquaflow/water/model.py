@@ -1,14 +1,15 @@
 """What sightings of surface points look like through trial water, and how that changes with it.
 
 An observation of point p in view v is ``gain_v shade(x, y) (J_p T(z) + uneven(x, y) B(z))`` (paper,
-Eq. 12). The best J of every point is linear, so it is eliminated (variable projection); what
-remains lies in one vector.
+Eq. 12), with T the share of J that is seen: what the water leaves of the light, a lamp's included.
+The best J of every point is linear, so it is eliminated (variable projection); what remains lies in
+one vector.
 """
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +50,16 @@ wide sigma for all dives lets gains that follow the range of each view take the 
 beta_a of a rendered dive of even light doubled, and Curasao's."""
 TINT_SIGMA = 0.005, 0.1
 """Prior: the same of how much a channel's log-gain differs from the mean of the three."""
+LAMP_SHARE_SIGMA = 1.5
+"""Prior: logit of the lamp's share in the light, around a half; weak."""
+LAMP_POWER, LAMP_POWER_SIGMA = 2.05, 0.1
+"""Prior: power of the range by which a lamp's light falls. 2 of a point; ground looked at obliquely
+turns away as it recedes, lamps beside the camera light what is near less: 1.9 to 2.5 on rendered
+dives. Left free (0.25) it takes the attenuation's place."""
+GLOW, GLOW_SIGMA = -3.5, 1.0
+"""Prior: log of what the water returns of a lamp's light (0.03); 0.02 to 0.1 on rendered dives."""
+LAMP = 2
+"""Logit of the share and the power, of all channels; the glow's three come on top."""
 WATER = 9
 """log beta_a, log b and logit B_inf, RGB each."""
 MAX_LOG_RATE = 5.0
@@ -79,16 +90,36 @@ class Model:
     exposure: bool = False
     uneven: bool = False
     """Backscatter brighter on one side of the picture than on the other; takes water."""
+    lamp: bool = False
+    """Light from beside the camera; takes water."""
 
     @property
     def is_possible(self) -> bool:
-        """Unevenness takes water."""
-        return self.water or not self.uneven
+        """Unevenness and lamps take water."""
+        return self.water or not (self.uneven or self.lamp)
 
     @property
     def takes_open_water(self) -> bool:
         """Shading and unevenness look alike, unless there is open water in view."""
         return self.uneven and self.shading
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Light from beside the camera on top of the light that is everywhere.
+
+    What is seen at range z gets ``1 - share + share (range / z)^power exp(-beta_a z)`` of the light
+    in which J is its colour.
+    """
+
+    share: float
+    power: float
+    range: float
+    """Map units."""
+
+
+NEAREST_LIT = 0.1
+"""Share of a lamp's reference range up to which its light is the same: nothing is seen so near."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +139,34 @@ class Trial:
     exposure: Array
     """[V, 3] log-gain of each view, of mean zero: no sighting tells brighter points from brighter
     views."""
+    lamp: Lamp | None = None
+    glow: Array = field(default_factory=lambda: np.zeros(3))
+    """[3] of the lamp's light that the water returns, nearly all of it close by: as from any range.
+    It stands in for the residual of the backscatter."""
+
+    def transmission(
+        self,
+        z: Array,  # [...]
+    ) -> Array:
+        """[..., 3] share of J that is seen."""
+        T = np.exp(-self.beta_a * z[..., None])
+        return T if self.lamp is None else T * (1.0 - self.lamp.share + self.beam(z))
+
+    def beam(
+        self,
+        z: Array,  # [...]
+    ) -> Array:
+        """[..., 3] light of the lamp on what is seen."""
+        assert self.lamp is not None
+        nearer = np.log(self.lamp.range / np.maximum(z, NEAREST_LIT * self.lamp.range))
+        log_light = self.lamp.power * nearer[..., None] - self.beta_a * z[..., None]
+        return np.asarray(self.lamp.share * np.exp(log_light))
 
 
 class WaterUnknowns:
     """Where each number of a ``Model`` lies in the vector, what it stands for, and its prior.
 
-    In the order log beta_a, log b, logit B_inf, unevenness, shading, exposures.
+    In the order log beta_a, log b, logit B_inf, unevenness, shading, lamp, log glow, exposures.
     """
 
     def __init__(self, model: Model, views: int, median_range: float) -> None:
@@ -124,11 +177,13 @@ class WaterUnknowns:
             WATER * model.water,
             TERMS * model.uneven,
             TERMS * model.shading,
+            LAMP * model.lamp,
+            3 * model.lamp,
             3 * views * model.exposure,
         )
         ends = np.cumsum((0, *sizes)).tolist()
         self.parts = [slice(*ends[k : k + 2]) for k in range(len(ends) - 1)]
-        self.water, self.uneven, self.shading, self.exposure = self.parts
+        self.water, self.uneven, self.shading, self.lamp, self.glow, self.exposure = self.parts
         self.size = ends[-1]
         self.start = np.zeros(self.size)
         if model.water:
@@ -136,6 +191,8 @@ class WaterUnknowns:
             green = red - RED_OVER_GREEN
             rates = [red, green, green + BLUE_OVER_GREEN]
             self.start[self.water] = [*rates, *rates, *[B_INF_LOGIT] * 3]
+        if model.lamp:
+            self.start[self.lamp], self.start[self.glow] = [0.0, LAMP_POWER], GLOW
         self._rows = self._prior_rows(EXPOSURE_SIGMA[0], TINT_SIGMA[0])
 
     def expecting(
@@ -170,8 +227,10 @@ class WaterUnknowns:
     def of_channel(self, c: int) -> npt.NDArray[np.int64]:
         """Where in the vector the parameters lie that channel ``c`` depends on."""
         water = [c, 3 + c, 6 + c] if self.model.water else []
-        shared = range(self.uneven.start, self.shading.stop)
-        return np.array([*water, *shared, *range(self.exposure.start + c, self.size, 3)], np.int64)
+        shared = range(self.uneven.start, self.lamp.stop)
+        # The glow's three, and of each view three, where there are any.
+        own = range(self.glow.start + c, self.size, 3)
+        return np.array([*water, *shared, *own], np.int64)
 
     def trial(
         self,
@@ -182,12 +241,18 @@ class WaterUnknowns:
         if model.water:
             rates, logit = np.clip(x[:6], -MAX_LOG_RATE, MAX_LOG_RATE), x[6:WATER]
             wet[:2] = np.exp(rates).reshape(2, 3)
-            wet[2] = 1.0 / (1.0 + np.exp(-np.clip(logit, -MAX_LOGIT, MAX_LOGIT)))
+            wet[2] = _share(logit)
         unevenness = x[self.uneven] if model.uneven else np.zeros(TERMS)
         shading = x[self.shading] if model.shading else np.zeros(TERMS)
         exposure = x[self.exposure] if model.exposure else np.zeros(3 * self.views)
         exposure = exposure.reshape(self.views, 3)
-        return Trial(wet[0], wet[1], wet[2], unevenness, shading, exposure - exposure.mean(axis=0))
+        exposure = exposure - exposure.mean(axis=0)
+        trial = Trial(wet[0], wet[1], wet[2], unevenness, shading, exposure)
+        if not model.lamp:
+            return trial
+        logit, power = x[self.lamp].tolist()
+        glow = np.exp(np.clip(x[self.glow], -MAX_LOGIT, 0.0))
+        return replace(trial, lamp=Lamp(float(_share(logit)), power, self.median_range), glow=glow)
 
     def priors(
         self,
@@ -209,6 +274,9 @@ class WaterUnknowns:
             rows[self.uneven, self.uneven] = np.diag(1.0 / UNEVEN_SIGMA)
         if self.model.shading:
             rows[self.shading, self.shading] = np.diag(1.0 / SHADING_SIGMA)
+        if self.model.lamp:
+            rows[self.lamp, self.lamp] = np.diag([1.0 / LAMP_SHARE_SIGMA, 1.0 / LAMP_POWER_SIGMA])
+            rows[self.glow, self.glow] = np.eye(3) / GLOW_SIGMA
         if self.model.exposure:
             rows[self.exposure, self.exposure] = np.kron(
                 np.eye(self.views), GREY / (np.sqrt(3.0) * exposure) + (np.eye(3) - GREY) / tint
@@ -326,7 +394,7 @@ class WaterModel(WaterUnknowns):
         """The observations, with the J that fit them best at these weights."""
         trial, seen = self.trial(x), self.seen
         gain = _gain(trial.exposure.T[:, seen.view] + trial.shading @ self._basis)
-        a = gain * np.exp(-trial.beta_a[:, None] * seen.z)
+        a = gain * trial.transmission(seen.z).T
         backscatter = gain * self._backscatter(trial, seen.z, self._basis, self._near)
         weighed = a if weight is None else weight * a
         own = self._colour - backscatter
@@ -347,7 +415,7 @@ class WaterModel(WaterUnknowns):
         lit = colour.T / _gain(trial.exposure.T[:, view] + trial.shading @ basis)
         near = self._B_res[:, None] * np.exp(-self._d[:, None] * z)
         veil = self._backscatter(trial, z, basis, near)
-        T = np.maximum(np.exp(-trial.beta_a[:, None] * z), TINY)
+        T = np.maximum(trial.transmission(z).T, TINY)
         return np.maximum((lit - veil) / T, 0.0)
 
     def _backscatter(
@@ -360,6 +428,7 @@ class WaterModel(WaterUnknowns):
         """[3, N] before the camera's gain."""
         if not self.model.water:
             return np.zeros_like(near)
+        near = near if trial.lamp is None else trial.glow[:, None]
         grown = -np.expm1(-trial.b[:, None] * z)
         return np.asarray(_gain(trial.unevenness @ basis) * (trial.B_inf[:, None] * grown + near))
 
@@ -378,12 +447,22 @@ class WaterModel(WaterUnknowns):
             beta_a, b, B_inf = trial.beta_a[c], trial.b[c], trial.B_inf[c]
             water_gain = now.gain[c] * _gain(trial.unevenness @ self._basis)
             passed = np.exp(-b * seen.z)
-            direct += [-beta_a * seen.z * light, water_gain * B_inf * b * seen.z * passed]
+            path = seen.z
+            if trial.lamp is not None:
+                beam = trial.beam(seen.z)[:, c]
+                lit_by = 1.0 - trial.lamp.share + beam
+                path = path * (1.0 + beam / lit_by)
+            direct += [-beta_a * path * light, water_gain * B_inf * b * seen.z * passed]
             direct += [water_gain * B_inf * (1.0 - B_inf) * (1.0 - passed)]
         if self.model.uneven:
             direct += list(now.backscatter[c] * self._basis)
         if self.model.shading:
             direct += list(lit * self._basis)
+        if trial.lamp is not None:
+            log_nearer = np.log(trial.lamp.range / seen.z)
+            share = (1.0 - trial.lamp.share) * (beam - trial.lamp.share)
+            direct += [light * share / lit_by, light * beam / lit_by * log_nearer]
+            direct += [water_gain * trial.glow[c]]
         rows = np.stack(direct) if direct else np.zeros((0, len(seen.z)))
         by_J = seen.sums_by_point(weight * a * rows) if len(rows) else np.zeros((0, seen.points))
         if self.model.exposure:
@@ -424,6 +503,13 @@ class WaterModel(WaterUnknowns):
         if not self.believed.regions:
             return single
         return np.vstack([single, self._regions.rows(J, changes, self.size)])
+
+
+def _share(
+    logit: Array | float,  # [...]
+) -> Array:
+    """[...] in (0, 1)."""
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(logit, -MAX_LOGIT, MAX_LOGIT))))
 
 
 def _gain(

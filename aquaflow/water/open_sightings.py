@@ -68,7 +68,7 @@ def open_area(
     height, width = image.shape[:2]
     lit = gain_map(trial.shading, height, width)[..., None] * np.exp(trial.exposure[view])
     B_inf = gain_map(trial.unevenness, height, width)[..., None] * trial.B_inf
-    T = np.exp(-trial.beta_a * z[..., None])
+    T = trial.transmission(z.astype(np.float64))
     ground = light_of_ground(mean, T, np.isfinite(z))
     is_open = open_water((image / lit).astype(np.float32), B_inf.astype(np.float32), ground)
     return is_open & picture.shows_scene()

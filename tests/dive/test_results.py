@@ -118,6 +118,7 @@ def test_a_summary_becomes_the_water_it_describes() -> None:
         beta_a_sigma=None,
         shading=[0.0] * 5,
         unevenness=[0.0] * 5,
+        lamp=None,
         exposure=1.0,
         highlight_compression=0.0,
     )

@@ -159,6 +159,8 @@ def _medium(data: dict[str, Any], frame: WorldFrame, times: float) -> dict[str, 
     ranges = dict.fromkeys(("range_p5", "range_p95", "map_ply_reference_range"), data)
     for name, of in (ranges | {"near_range": data["restored"]}).items():
         of[name] = None if of[name] is None else times * of[name]
+    if data.get("lamp") is not None:  # absent in dives before 2026-11-26
+        data["lamp"]["range"] *= times
     data["attenuation_unit"] = data["units"]["attenuation, b, d"] = "1/m"
     return data
 
