@@ -243,4 +243,5 @@ def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
 def water_of(summary: WaterSummary, device: torch.device = CPU) -> WaterParameters:
     """The summary as tensors."""
     fields = (summary.beta_a, summary.B_inf, summary.b, summary.B_res, summary.d)
-    return WaterParameters(*(water_in(values, device) for values in fields), lamp=summary.lamp)
+    beta_a, B_inf, b, B_res, d = (water_in(values, device) for values in fields)
+    return WaterParameters(beta_a, B_inf, b, B_res, d, summary.lamp)

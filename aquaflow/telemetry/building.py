@@ -31,6 +31,7 @@ from aquaflow.telemetry.factors import (
 from aquaflow.telemetry.solve import ANY_TURN, FIXED, OPEN_M, Carried, TelemetryProblem
 from aquaflow.telemetry.state import (
     CAMERA,
+    CLOCK,
     DVL,
     DVL_SCALE,
     HEADING,
@@ -306,7 +307,7 @@ def _as_mounted(
     prior[CAMERA], prior[DVL] = sigma, np.radians(config.mounting_sigma_deg)
     prior[DVL_SCALE] = max(config.dvl_scale_sigma, 1e-6)
     prior[HEADING] = np.radians(config.heading_sigma_deg)
-    prior[LAG] = max(config.position_lag_sigma_s, 1e-6)
+    prior[LAG], prior[CLOCK] = max(config.position_lag_sigma_s, 1e-6), 1e-6
     state = MetricState(0.0, np.eye(3), np.zeros(3), R_bc, c_b, np.eye(3))
     return TelemetryProblem(state, prior, mounted=mounted)
 

@@ -37,6 +37,11 @@ class CameraPath:
     def __len__(self) -> int:
         return len(self.t_s)
 
+    @property
+    def middle_s(self) -> float:
+        """s, between the first pose and the last."""
+        return float(0.5 * (self.t_s[0] + self.t_s[-1]))
+
     def covers(
         self,
         t_s: Array,  # [M] s

@@ -14,10 +14,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.telemetry.building import USED
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.solve import TelemetryProblem
 from aquaflow.telemetry.telemetry import Series, Telemetry, device_of
 from aquaflow.telemetry.time_offset import (
+    DRIFT_SIGMA,
     NotSynchronisedError,
     TimeOffset,
     UnlikeError,
@@ -25,7 +27,7 @@ from aquaflow.telemetry.time_offset import (
 )
 from aquaflow.telemetry.turns import SHORTEST_OVERLAP_S, Turns, best_turns
 from aquaflow.telemetry.world_frame import SourceReport, WorldFrame
-from aquaflow.types import AngularRate, Attitude
+from aquaflow.types import KINDS, AngularRate, Attitude
 
 Array = npt.NDArray[np.float64]
 
@@ -39,8 +41,13 @@ REACH_S = 60.0
 NEGLIGIBLE_S = 0.1
 """An ROV turns by less than a degree in it, and rises by 3 cm: samples are left where they are."""
 LARGEST_STEP_S = 0.25
-"""Between the offsets of two pieces; where they differ by more, the samples between the two have no
-time that is known."""
+"""Between the offsets of two pieces, or of the two ends of one; where they differ by more, the
+samples between the two have no time that is known."""
+LATENCY_S = 0.02
+"""1 sigma of the moment of a depth or a velocity against the rotations of the same device: the
+MS5837 converts for 2 x 18 ms (data sheet), a DVL's ping takes as long to the ground and back."""
+EVIDENT_DRIFT = 3.0
+"""Sigmas from which a drift within a piece is no matter of noise."""
 LEAST_EVIDENT_RAD_S = np.radians(1.0)
 """RMS rate of camera and vehicle from which their being unlike is no matter of noise: smoothed,
 poses have 0.1 and attitudes 0.3 degrees/s."""
@@ -49,6 +56,9 @@ LEAST_MEASURED = 0.5
 
 MEASURED_IN_TIME = ("depth", "velocity", "altitude")
 """Kinds that know metres and say nothing if their moment is not known."""
+MOVED_IN_TIME = ("depth", "velocity")
+"""Of these the kinds whose metres are a movement: another moment has another one, and a clock at
+another rate makes it faster."""
 SHOWN_BY_THE_PATH = ("position", "length")
 """Kinds that need no rotation: fixes at other moments do not lie along the path, and what a picture
 shows of known size has the picture's own time."""
@@ -65,10 +75,17 @@ class DeviceClockEstimate:
     """[K] pictures' time less its stamps."""
     sigma_s: Array = field(default_factory=lambda: np.empty(0))
     """[K]"""
+    drift: Array = field(default_factory=lambda: np.empty(0))
+    """[K] growth of the offset within each piece, s/s."""
+    drift_sigma: Array = field(default_factory=lambda: np.empty(0))
+    """[K]"""
     unknown_s: tuple[tuple[float, float], ...] = ()
-    """Stretches of its stamps in which its rotations were unlike the camera's."""
+    """Stretches of its stamps in which its rotations were unlike the camera's, or its clock ran at
+    another rate."""
     unlike: bool = False
     """True if it turned unlike the camera in at least one piece."""
+    drifts: bool = False
+    """True if its clock ran at another rate than the pictures' in at least one piece."""
     reason: str = ""
     """Why no offset was found; empty where one was."""
 
@@ -82,6 +99,18 @@ class DeviceClockEstimate:
         """True if samples may stay where they are."""
         within = np.abs(self.offset_s) <= np.maximum(NEGLIGIBLE_S, 2.0 * self.sigma_s)
         return bool(within.all()) and not self.unknown_s
+
+    @property
+    def sigma(self) -> tuple[float, float]:
+        """1 sigma of what is left of the offset, s, and of its growth, s/s: of what was not
+        corrected all of it, and what the rotations leave open."""
+        if not self.known:
+            return LATENCY_S, DRIFT_SIGMA
+        left_s, left_sigma_s = _mean_of(self.offset_s, self.sigma_s)
+        drift, drift_sigma = _mean_of(self.drift, self.drift_sigma)
+        left_s = left_s if self.right else 0.0
+        sigma_s = float(np.linalg.norm([LATENCY_S, left_s, left_sigma_s]))
+        return sigma_s, float(np.hypot(drift, drift_sigma))
 
     @property
     def latest_s(self) -> float:
@@ -101,6 +130,8 @@ class DeviceClockEstimate:
 
     def in_words(self) -> str:
         """What was done about it, for the user; empty where nothing was."""
+        if self.drifts and not self.known:
+            return f"'{self.device}' is left out: {self.reason}"
         if not self.known or self.right:
             return ""
         late = f"{abs(self.latest_s):.2f} s {'late' if self.latest_s < 0.0 else 'early'}"
@@ -164,6 +195,12 @@ class DeviceClocks:
         clock = self.own.get(device_of(source))
         return clock is not None and clock.known
 
+    def sigma_of(self, problem: TelemetryProblem) -> Array:
+        """[2] 1 sigma of ``CLOCK``: of the worst clock among those of what moved in time."""
+        moved = [factor.source for factor in problem.factors if factor.kind in MOVED_IN_TIME]
+        sigmas = [self.clock_of(source).sigma for source in moved]
+        return np.asarray(np.max([(LATENCY_S, DRIFT_SIGMA), *sigmas], axis=0))
+
     @property
     def why_open(self) -> str:
         """Why rotations do not show whether all clocks agree."""
@@ -177,15 +214,17 @@ class DeviceClocks:
         moved_s = 0.0 if clock.right else clock.latest_s
         return replace(frame, scale_source=said, clock_offset_s=moved_s)
 
-    def unlike(self, telemetry: Telemetry) -> dict[tuple[str, str], SourceReport]:
-        """Attitudes of devices that turned otherwise than the camera, by source and kind."""
+    def left_out(self, telemetry: Telemetry) -> dict[tuple[str, str], SourceReport]:
+        """Sources whose times are not known at all, by name and kind: attitudes of devices that
+        turned otherwise than the camera, and all that a clock of another rate has stamped."""
         found = {}
-        for series in telemetry.of(Attitude):
-            clock = self.clock_of(series.source)
-            if clock.unlike and not clock.known:
-                found[series.source, "attitude"] = SourceReport(
-                    series.source, "attitude", rejected=len(series), reason=clock.reason
-                )
+        for kind in (kind for kind in USED if kind not in SHOWN_BY_THE_PATH):
+            for series in telemetry.of(KINDS[kind]):
+                clock = self.clock_of(series.source)
+                if not clock.known and (clock.drifts or (clock.unlike and kind == "attitude")):
+                    found[series.source, kind] = SourceReport(
+                        series.source, kind, rejected=len(series), reason=clock.reason
+                    )
         return found
 
     def correct(self, telemetry: Telemetry) -> Telemetry:
@@ -218,7 +257,8 @@ def _clock(
     """A device's clock from its turns and the camera's."""
     found: list[tuple[float, TimeOffset]] = []
     unlike: list[tuple[float, float]] = []
-    reason, expected_s = "the camera's path is too short", 0.0
+    drifting: list[tuple[float, float]] = []
+    reason, drift_reason, expected_s = "the camera's path is too short", "", 0.0
     for piece in pieces:
         first_s, last_s = float(piece.start_s[0]), float(piece.end_s[-1])
         near = (body.end_s >= first_s - REACH_S) & (body.start_s <= last_s + REACH_S)
@@ -232,17 +272,48 @@ def _clock(
         except NotSynchronisedError as error:
             reason = str(error)
         else:
+            if _drifts(offset, last_s - first_s):
+                drift_reason = _drift_in_words(offset)
+                drifting.append((first_s - offset.offset_s, last_s - offset.offset_s))
+                continue
             expected_s = offset.offset_s
             found.append((0.5 * (first_s + last_s) - expected_s, offset))
     if not found:
-        return DeviceClockEstimate(device, unlike=bool(unlike), reason=reason)
+        return DeviceClockEstimate(
+            device, unlike=bool(unlike), drifts=bool(drifting), reason=drift_reason or reason
+        )
     found.sort(key=lambda each: each[0])
     at_s = np.array([at for at, _ in found])
     offset_s = np.array([offset.offset_s for _, offset in found])
     sigma_s = np.array([offset.sigma_s for _, offset in found])
+    drift = np.array([offset.drift for _, offset in found])
+    drift_sigma = np.array([offset.drift_sigma for _, offset in found])
+    unknown_s = _unknown(at_s, offset_s, [*unlike, *drifting])
     return DeviceClockEstimate(
-        device, at_s, offset_s, sigma_s, _unknown(at_s, offset_s, unlike), bool(unlike)
-    )
+        device, at_s, offset_s, sigma_s, drift, drift_sigma, unknown_s,
+        bool(unlike), bool(drifting),
+    )  # fmt: skip
+
+
+def _mean_of(
+    values: Array,  # [K]
+    sigma: Array,  # [K]
+) -> tuple[float, float]:
+    """The weighted mean and its 1 sigma."""
+    weight = sigma**-2.0
+    return float(weight @ values / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def _drifts(offset: TimeOffset, length_s: float) -> bool:
+    """True if no offset is that of a whole piece."""
+    changed_s = abs(offset.drift) * length_s
+    evident = abs(offset.drift) > EVIDENT_DRIFT * offset.drift_sigma
+    return evident and changed_s > LARGEST_STEP_S
+
+
+def _drift_in_words(offset: TimeOffset) -> str:
+    fast = "slower" if offset.drift > 0.0 else "faster"
+    return f"its clock runs {100.0 * abs(offset.drift):.0f} % {fast} than that of the pictures"
 
 
 def _offset(
@@ -257,11 +328,11 @@ def _offset(
         NotSynchronisedError: as :func:`estimate_time_offset`.
     """
     try:
-        return estimate_time_offset(camera, body, R_cb, expected_s)
+        return estimate_time_offset(camera, body, R_cb, expected_s, any_drift=True)
     except UnlikeError:
         if R_cb is None:
             raise
-        return estimate_time_offset(camera, body, None, expected_s)
+        return estimate_time_offset(camera, body, None, expected_s, any_drift=True)
 
 
 def _unknown(

@@ -25,7 +25,7 @@ from aquaflow.telemetry.device_clocks import DeviceClocks
 from aquaflow.telemetry.factors import Factor
 from aquaflow.telemetry.solve import Carried, Solution, TelemetryProblem, solve
 from aquaflow.telemetry.start import camera_in_body
-from aquaflow.telemetry.state import SCALE, SHIFT, TURN
+from aquaflow.telemetry.state import CLOCK, SCALE, SHIFT, TURN
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import (
     LARGEST_SCALE_SIGMA,
@@ -84,16 +84,19 @@ def estimate(
     R_cb = None if mounting is None else camera_in_body(mounting).R.T
     clocks = DeviceClocks.of(telemetry, path, R_cb)
     telemetry = clocks.correct(telemetry)
-    rejected = clocks.unlike(telemetry)
+    rejected = clocks.left_out(telemetry)
 
     def problem_along(path: CameraPath, points: Callable[[], Array]) -> TelemetryProblem:
-        return problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
+        found = problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
+        found.prior[CLOCK] = clocks.sigma_of(found)
+        return found
 
     while True:
         problem = problem_along(path, points)
         if not problem.factors:
             unused = WorldFrame.unknown("no telemetry could be used")
-            return Estimate(replace(unused, sources=tuple(problem.reports)))
+            unused = replace(unused, sources=tuple(problem.reports))
+            return Estimate(clocks.with_clocks(unused))
         solution = solve(problem.factors, problem.start, problem.prior)
         wrong = contradiction_in(problem, solution)
         if wrong is None:

@@ -17,6 +17,7 @@ from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.start import Process, SlowPart
 from aquaflow.telemetry.state import (
     CAMERA,
+    CLOCK,
     DVL,
     DVL_SCALE,
     HEADING,
@@ -347,7 +348,7 @@ class DepthFactor(Factor):
         ),
     )
     """m: tide, temperature and the camera's own drift; waves reach down to half their length."""
-    spans = (SCALE, TURN, SHIFT, CAMERA)
+    spans = (SCALE, TURN, SHIFT, CAMERA, CLOCK)
 
     def __init__(self, depth: Series, path: CameraPath) -> None:
         """``path`` covers all samples."""
@@ -356,10 +357,12 @@ class DepthFactor(Factor):
         self.sigma = np.full(len(depth), DEPTH_SIGMA_M)
         self._depth_m = depth.values[:, 0]
         self._R_mc, self._p_m = path.at(depth.t_s)
+        self._v_m, self._since_s = path.velocity(depth.t_s), depth.t_s - path.middle_s
 
     def residuals(self, state: MetricState) -> Array:
         """[N, 1] m."""
-        _, p_n = state.body(self._R_mc, self._p_m)
+        late_s = state.late_at_s(self._since_s)[:, None]
+        _, p_n = state.body(self._R_mc, self._p_m - late_s * self._v_m)
         return np.asarray(p_n[:, 2:] - self._depth_m[:, None])
 
 
@@ -477,7 +480,7 @@ class VelocityFactor(Factor):
     kind = "velocity"
     slow = SlowPart(0.0015, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
     """m in an interval: the camera's own scale wanders along the path, by 0.3 % of 0.5 m."""
-    spans = (SCALE, CAMERA, DVL, DVL_SCALE)
+    spans = (SCALE, CAMERA, DVL, DVL_SCALE, CLOCK)
 
     def __init__(self, velocity: Series, path: CameraPath) -> None:
         """``path`` covers all samples."""
@@ -491,6 +494,8 @@ class VelocityFactor(Factor):
         R_begin, p_begin = path.at(begin)
         R_end, p_end = path.at(end)
         self._moved_m, self._turned = p_end - p_begin, R_end - R_begin
+        self._v_m = path.velocity(begin), path.velocity(end)
+        self._since_s = begin - path.middle_s, end - path.middle_s
         self._axes = axes_along(self._moved_m)
         merit = np.maximum(velocity.values[:, 3], LEAST_SIGMA_M_S)
         spacing = (end - begin) / np.maximum(last - first, 1)
@@ -505,7 +510,11 @@ class VelocityFactor(Factor):
         way = np.asarray(cumulative_trapezoid(v_m, self._tau, axis=0, initial=0))
         arm = self._turned @ (R_cb @ state.c_b)
         body = way[self._last] - way[self._first]
-        apart = state.scale * self._moved_m - body - arm
+        earlier, later = (
+            state.late_at_s(since_s)[:, None] * v_m
+            for since_s, v_m in zip(self._since_s, self._v_m, strict=True)
+        )
+        apart = state.scale * (self._moved_m - later + earlier) - body - arm
         return np.asarray(np.einsum("nij,nj->ni", self._axes, apart))
 
     def scale_misfit(self, state: MetricState) -> tuple[Array, Array]:

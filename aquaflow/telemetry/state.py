@@ -11,12 +11,12 @@ from aquaflow.geometry.similarity import so3_exp
 
 Array = npt.NDArray[np.float64]
 
-SCALE, TURN, SHIFT, CAMERA, DVL, DVL_SCALE, HEADING, LAG = (
+SCALE, TURN, SHIFT, CAMERA, DVL, DVL_SCALE, HEADING, LAG, CLOCK = (
     slice(0, 1), slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 13), slice(13, 14),
-    slice(14, 15), slice(15, 16),
+    slice(14, 15), slice(15, 16), slice(16, 18),
 )  # fmt: skip
 """Where each parameter stands in a step [P]."""
-P = 16
+P = 18
 """Length of a step."""
 
 
@@ -42,6 +42,10 @@ class MetricState:
     """rad, constant error of the compass."""
     lag_s: float = 0.0
     """s by which position fixes are older than they state."""
+    late_s: float = 0.0
+    """s by which depths and velocities are older than they state, in the middle of the path."""
+    late_rate: float = 0.0
+    """s by which they grow older in a second."""
 
     @property
     def scale(self) -> float:
@@ -63,7 +67,16 @@ class MetricState:
             log_dvl=self.log_dvl + float(step[DVL_SCALE][0]),
             heading=self.heading + float(step[HEADING][0]),
             lag_s=self.lag_s + float(step[LAG][0]),
+            late_s=self.late_s + float(step[CLOCK][0]),
+            late_rate=self.late_rate + float(step[CLOCK][1]),
         )
+
+    def late_at_s(
+        self,
+        since_s: Array,  # [N] s after the middle of the path
+    ) -> Array:
+        """[N] s by which depths and velocities are older than they state."""
+        return np.asarray(self.late_s + self.late_rate * since_s)
 
     def body(
         self,

@@ -64,6 +64,9 @@ DERIVATIVE_S = 0.01
 """Half the step of the derivative with respect to time: below the interval of any gyro's log."""
 LONGEST_CORRELATION_S = 2.0
 """Up to this lag the residuals' own autocorrelation enters the covariance."""
+ANY_DRIFT_SIGMA = 0.3
+"""1 sigma of a clock's rate where no crystal limits it: a stream that falls behind ever more, or
+pictures at another rate than is stated, 25 for 30 a second."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ class Refinement:
             [FREE_SIGMA, DRIFT_SIGMA, *[turn] * 3, *[BIAS_SIGMA_RAD_S] * 3, LOG_SCALE_SIGMA]
         )
 
-    def fit(self, peak: OffsetPeak) -> OffsetFit | None:
+    def fit(self, peak: OffsetPeak, drift_sigma: float = DRIFT_SIGMA) -> OffsetFit | None:
         """The optimum near ``peak``; None where too little is measured there."""
         used = self._used_points(peak.offset_s)
         if 3 * used.sum() <= 2 * PARAMETERS:
@@ -133,10 +136,10 @@ class Refinement:
         at_s, seen = self.at_s[used], self._seen[used]
         middle_s = float(at_s.mean()) - peak.offset_s
         model = _Model(self._camera, self._body, smooth, at_s, seen, middle_s, peak.R_cb)
-        start = np.zeros(PARAMETERS)
-        start[OFFSET] = peak.offset_s
+        start, sigmas = np.zeros(PARAMETERS), self._sigmas.copy()
+        start[OFFSET], sigmas[DRIFT] = peak.offset_s, drift_sigma
         problem = _Turning(
-            model.residuals, model.jacobian, Huber(), start, self._sigmas, least_noise=1e-9
+            model.residuals, model.jacobian, Huber(), start, sigmas, least_noise=1e-9
         )
         x = minimise(problem, start, RULES).state
         problem.linearise(x)
@@ -147,7 +150,7 @@ class Refinement:
         J_seen = J.copy()
         J_seen[:, :, OFFSET] = -self._change[used]
         J_seen[:, :, DRIFT] = J_seen[:, :, OFFSET] * (at_s - x[OFFSET] - middle_s)[:, None]
-        prior = np.diag(self._sigmas**-2.0)
+        prior = np.diag(sigmas**-2.0)
         H = np.einsum("gip,gi,giq->pq", J, weight, J_seen) / sigma**2 + prior
         covariance = sandwich_of(J, weight * residual, H, prior, sigma, used, self._step_s)
         whole = np.zeros((len(used), 3))
@@ -368,12 +371,15 @@ def estimate_time_offset(
     body: Turns,
     R_cb: Array | None = None,  # [3, 3]
     expected_s: float | None = None,
+    any_drift: bool = False,
 ) -> TimeOffset:
     """The offset of a log, from the turns of a camera and of the vehicle that carries it.
 
     ``R_cb`` is the rotation from body to camera axes where it is known, to some degrees: it
     excludes offsets that need another. Either way it is found too. Of offsets that explain the
-    rotations equally well, the one near ``expected_s`` counts, where one is expected.
+    rotations equally well, the one near ``expected_s`` counts, where one is expected. With
+    ``any_drift`` the drift about it is what the rotations show, however large; without, no more
+    than crystals have.
 
     Raises:
         NotSynchronisedError: too little was measured or moved, nothing correlates
@@ -395,15 +401,31 @@ def estimate_time_offset(
             )
     refinement = Refinement(camera, body, sigma_s, mounting_known=R_cb is not None)
     fits = [fit for peak in peaks(*cells, R_cb) if (fit := refinement.fit(peak)) is not None]
+    found = None
     if expected_s is not None:
         found = _as_expected(cells, R_cb, expected_s, refinement, fits, sigma_s)
-        if found is not None:
-            return found
-    if not fits:
-        raise UnlikeError("the log's rotations resemble the video's at no offset")
-    best = max(fits, key=lambda fit: fit.gain)
-    rivals = [fit for fit in fits if abs(fit.x[OFFSET] - best.x[OFFSET]) > sigma_s]
-    return _judge(best, rivals, sigma_s)
+    if found is None:
+        if not fits:
+            raise UnlikeError("the log's rotations resemble the video's at no offset")
+        best = max(fits, key=lambda fit: fit.gain)
+        rivals = [fit for fit in fits if abs(fit.x[OFFSET] - best.x[OFFSET]) > sigma_s]
+        found = _judge(best, rivals, sigma_s)
+    return _with_any_drift(found, refinement, R_cb) if any_drift else found
+
+
+def _with_any_drift(
+    found: TimeOffset,
+    refinement: Refinement,
+    R_cb: Array | None,  # [3, 3]
+) -> TimeOffset:
+    """The offset with the drift that the rotations show about it."""
+    R_start = found.R_cb if R_cb is None else R_cb
+    assert R_start is not None
+    fit = refinement.fit(OffsetPeak(found.offset_s, R_start, 1.0), ANY_DRIFT_SIGMA)
+    if fit is None:
+        return replace(found, drift=0.0, drift_sigma=ANY_DRIFT_SIGMA)
+    sigma = float(np.hypot(DRIFT_SIGMA, np.sqrt(fit.covariance[DRIFT, DRIFT])))
+    return replace(found, drift=float(fit.x[DRIFT]), drift_sigma=sigma)
 
 
 def _as_expected(

@@ -23,7 +23,7 @@ from aquaflow.telemetry.factors import (
     TiltFactor,
     VelocityFactor,
 )
-from aquaflow.telemetry.state import MetricState
+from aquaflow.telemetry.state import MetricState, P
 from aquaflow.telemetry.telemetry import Series
 
 Array = npt.NDArray[np.float64]
@@ -132,5 +132,5 @@ class ExactScene:
 
 def disturbed(state: MetricState, seed: int, size: float) -> MetricState:
     """A state near another, in every parameter."""
-    step = size * np.random.default_rng(seed).normal(size=16)
+    step = size * np.random.default_rng(seed).normal(size=P)
     return state.move(step)

@@ -11,6 +11,7 @@ import pytest
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.device_clocks import DeviceClocks
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import AngularRate, Depth
 from tests.telemetry.turning import orientations, random_rates, shaken
 
@@ -68,3 +69,34 @@ def test_a_gyro_of_another_vehicle_shows_no_clock() -> None:
     clocks = DeviceClocks.of(telemetry, CameraPath(path.t_s, R, path.p_m), np.eye(3))
     assert not clocks.known
     assert clocks.reference.unlike
+
+
+@pytest.mark.parametrize("drift", [-0.06, 0.06])
+@pytest.mark.parametrize("mounting", [np.eye(3), None])
+def test_nothing_is_used_that_a_clock_of_another_rate_has_stamped(
+    drift: float, mounting: Array | None
+) -> None:
+    telemetry, path = dive(lambda t: (1.0 + drift) * t, seconds=6.0)
+    clocks = DeviceClocks.of(telemetry, path, mounting)
+    assert not clocks.known
+    [(key, report)] = clocks.left_out(telemetry).items()
+    assert key == ("autopilot/SCALED_PRESSURE2", "depth")
+    assert f"% {'faster' if drift > 0.0 else 'slower'} than that of the pictures" in report.reason
+    assert report.reason in clocks.with_clocks(WorldFrame.unknown()).scale_source
+
+
+@pytest.mark.parametrize(("drift", "most"), [(0.0, 0.01), (0.03, 0.05), (-0.03, 0.05)])
+def test_a_drift_that_is_not_corrected_is_part_of_the_sigma(drift: float, most: float) -> None:
+    telemetry, path = dive(lambda t: (1.0 + drift) * t, seconds=6.0)
+    clock = DeviceClocks.of(telemetry, path, np.eye(3)).reference
+    assert clock.known
+    assert 0.8 * abs(drift) < clock.sigma[1] < most
+
+
+@pytest.mark.parametrize(("offset_s", "least_s"), [(0.0, 0.0), (0.08, 0.08), (0.3, 0.0)])
+def test_an_offset_that_is_not_corrected_is_part_of_the_sigma(
+    offset_s: float, least_s: float
+) -> None:
+    telemetry, path = dive(lambda t: t + offset_s)
+    sigma_s = DeviceClocks.of(telemetry, path, np.eye(3)).reference.sigma[0]
+    assert least_s < sigma_s < least_s + 0.03

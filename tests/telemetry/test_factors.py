@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors import (
+    DepthFactor,
     Factor,
     ForceFactor,
     HeadingFactor,
@@ -19,7 +20,7 @@ from aquaflow.telemetry.factors import (
     VelocityFactor,
     axes_along,
 )
-from aquaflow.telemetry.state import LAG, SCALE, MetricState, P
+from aquaflow.telemetry.state import CLOCK, LAG, SCALE, MetricState, P
 from aquaflow.telemetry.telemetry import Series
 from tests.telemetry.exact_scene import ExactScene, disturbed
 
@@ -106,6 +107,20 @@ def test_a_fix_that_is_older_than_it_says_shows_as_lag() -> None:
     step = np.zeros(P)
     step[LAG] = 0.8
     np.testing.assert_allclose(factor.residuals(state.move(step)), 0.0, atol=1e-12)
+
+
+def test_a_depth_and_a_dvl_of_a_clock_that_is_late_and_slow_show_it() -> None:
+    t = np.arange(0.0, 20.0, 0.1)
+    v = np.array([0.5, 0.2, 0.1])
+    path = CameraPath(t, np.tile(np.eye(3), (len(t), 1, 1)), t[:, None] * v)
+    state = MetricState(0.0, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
+    true_s = t - (0.3 + 0.05 * (t - path.middle_s))
+    depth = Series("bar30", t, v[2] * true_s[:, None])
+    dvl = Series("dvl", t, np.tile([*(0.95 * v), 0.01], (len(t), 1)))
+    step = np.zeros(P)
+    step[CLOCK] = 0.3, 0.05
+    for factor in (DepthFactor(depth, path), VelocityFactor(dvl, path)):
+        np.testing.assert_allclose(factor.residuals(state.move(step)), 0.0, atol=1e-12)
 
 
 def test_the_scale_that_each_displacement_wants_is_the_true_one() -> None:
