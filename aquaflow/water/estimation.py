@@ -61,7 +61,7 @@ VISIBLE_DEPTH = 0.12
 """Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
 scenes without water look like 0.02 to 0.05."""
 LAMP_SHOWS = 20.0
-"""Log odds for a lamp from which it is taken as seen: below 5 on rendered dives by daylight and the
+"""Log odds for a lamp from which it is taken as seen: up to 5 on rendered dives by daylight and the
 shared clips, 200 to 700 on ten rendered dives with lamps."""
 EVERY_MODEL = tuple(
     Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible

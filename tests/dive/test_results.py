@@ -9,6 +9,7 @@ import torch
 from aquaflow.config import Config
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.map_file import water_of
+from aquaflow.dive.metric_outputs import water_in
 from aquaflow.dive.results import (
     WaterSummary,
     largest_sub_map,
@@ -20,6 +21,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped, Frame
+from aquaflow.water.model import Lamp
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 
@@ -126,3 +128,29 @@ def test_a_summary_becomes_the_water_it_describes() -> None:
     z = torch.tensor([1.0])
     torch.testing.assert_close(water.transmission(z)[0], torch.exp(-torch.tensor([0.4, 0.2, 0.1])))
     assert water.backscatter(z)[0, 2] == pytest.approx(0.3 * (1.0 - np.exp(-0.3)), abs=1e-6)
+
+
+def test_a_lamps_range_is_in_the_unit_of_the_other_ranges() -> None:
+    lamp = Lamp(share=0.7, power=2.0, range=1.5)
+    summary = WaterSummary(
+        **{name: [0.3] * 3 for name in ("beta_a", "b", "B_inf", "B_res", "d", "white_gain")},
+        range_p5=0.5,
+        range_median=1.0,
+        range_p95=2.0,
+        near_range=None,
+        white_choice="camera",
+        chosen_gain=[1.0] * 3,
+        chosen_gain_sigma=None,
+        range_variance=None,
+        lightness_over_range=None,
+        beta_a_sigma=None,
+        shading=[0.0] * 5,
+        unevenness=[0.0] * 5,
+        lamp=lamp,
+        exposure=1.0,
+        highlight_compression=0.0,
+    )
+    scaled, z = water_in(summary, 2.0), torch.tensor([0.4, 1.5, 3.0])
+    assert scaled.lamp == Lamp(share=0.7, power=2.0, range=3.0)
+    seen = water_of(summary).transmission(z)
+    torch.testing.assert_close(water_of(scaled).transmission(2.0 * z), seen)

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.config import MediumConfig
+from aquaflow.config import MappingConfig, MediumConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import scene as scene_module
+from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
+from aquaflow.mapping.state import deserialise, serialise
+from aquaflow.render.reference import ReferenceRenderer
+from aquaflow.water.model import Lamp
 from aquaflow.water.white_balance import ChosenWhite
 from tests.mapping.mapping_scenes import (
     fit_water,
@@ -161,6 +165,31 @@ def test_shading_multiplies_the_picture_and_restoring_divides_by_it() -> None:
     grey = view_of(np.full((48, 64, 3), 102, np.uint8))
     restored, _ = lit.restore(grey, torch.ones(48, 64))
     torch.testing.assert_close(restored, 0.4 / gain[..., None].expand(48, 64, 3))
+
+
+def test_a_map_is_drawn_by_a_lamps_light_and_its_picture_restored_from_it() -> None:
+    lit = scene(enabled=True)
+    lit.gaussians = floor(columns=40, rows=30, scale=0.04)
+    plain = lit.show(BLANK)
+    lit.lamp = Lamp(share=0.7, power=2.0, range=1.0)
+    shown, water = lit.show(BLANK), lit.water(BLANK)
+    assert water is not None
+    assert torch.equal(shown.radiance, plain.radiance)
+    by_lamp = water.transmission(shown.z) - replace(water, lamp=None).transmission(shown.z)
+    torch.testing.assert_close(shown.image, plain.image + shown.radiance * by_lamp)
+    J = torch.full((48, 64, 3), 0.6)
+    z = torch.linspace(0.7, 2.0, 64).expand(48, 64)
+    seen = (J * water.transmission(z) + water.backscatter(z)).detach()
+    view = view_of(np.rint(255.0 * seen.numpy()).astype(np.uint8))
+    restored, _ = lit.restore(view, z)
+    torch.testing.assert_close(restored, J, atol=0.03, rtol=0.0)
+
+
+def test_a_lamp_is_kept_with_the_map() -> None:
+    mapper = Mapper(MappingConfig(), ReferenceRenderer(), 0)
+    assert deserialise(*serialise(mapper), ReferenceRenderer()).scene.lamp is None
+    mapper.scene.lamp = Lamp(share=0.7, power=2.0, range=1.0)
+    assert deserialise(*serialise(mapper), ReferenceRenderer()).scene.lamp == mapper.scene.lamp
 
 
 def test_every_picture_size_has_its_own_shading() -> None:
