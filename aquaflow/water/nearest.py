@@ -60,7 +60,12 @@ def nearest_of(
     return Nearest(view, xy, z, colour)
 
 
-def _in_picture(picture: PosedPicture, trial: Trial, mean: Array, view: int) -> Nearest:
+def _in_picture(
+    picture: PosedPicture,
+    trial: Trial,
+    mean: Array,  # [3]
+    view: int,
+) -> Nearest:
     image, z = picture.half_size(), picture.surface_ranges()
     # Where open water ends there is texture in the window, but no surface yet.
     window = np.ones((2 * WINDOW_PX, 2 * WINDOW_PX), np.uint8)

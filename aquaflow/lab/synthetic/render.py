@@ -198,7 +198,7 @@ def _may_meet(
 def _trace(
     scene: SyntheticScene,
     camera: CameraModel,
-    met: Met,
+    met: Met,  # of N rays: [3] or [3, N], [3, N], [N], [N]
     part: slice,
     k: int,
 ) -> npt.NDArray[np.float32]:
@@ -234,7 +234,7 @@ def _trace(
 def _lit(
     scene: SyntheticScene,
     light: LampLight,
-    met: Met,
+    met: Met,  # of N rays: [3] or [3, N], [3, N], [N], [N]
     J: npt.NDArray[np.float32],  # [k R, k W, 3]
 ) -> npt.NDArray[np.floating]:
     """[k R, k W, 3] what the rays see by daylight and lamps."""
