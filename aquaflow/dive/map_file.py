@@ -29,7 +29,7 @@ from aquaflow.render.views import View
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.medium import WaterParameters
 from aquaflow.water.sightings import SOLID
-from aquaflow.water.white_balance import CAMERA
+from aquaflow.water.white_balance import ChosenWhite
 
 SUFFIX = ".aqf"
 """Of a map file."""
@@ -161,13 +161,7 @@ def splats_of(mapper: Mapper) -> PlyGaussians:
     With a decoder, each Gaussian as the mapped view nearest to it sees it.
     """
     plain = mapper.scene.bake_parameters(mapper.views)
-    return PlyGaussians(
-        means=map_out(plain["means"]),
-        wxyz=map_out(torch.nn.functional.normalize(plain["quats"], dim=-1)),
-        scales=map_out(torch.exp(plain["log_scales"])),
-        opacities=map_out(torch.sigmoid(plain["opacity_logits"][:, 0])),
-        colours=map_out(radiance(plain["raw_colours"])),
-    )
+    return _splats(plain, map_out(radiance(plain["raw_colours"])))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -191,6 +185,7 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
         return None
     low, high = np.percentile(picture_out(z), RANGE_PERCENTILES)
     first, tone, balance = waters[0], shown_tone(mapper), mapper.scene.balance
+    chosen = ChosenWhite() if balance is None else balance.chosen
     summary = WaterSummary(
         water_out(torch.stack([water.beta_a for water in waters]).mean(0)).tolist(),
         water_out(first.b).tolist(),
@@ -201,9 +196,9 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
         float(z.median()),
         float(high),
         water_out(mapper.scene.white_gain()).tolist(),
-        CAMERA if balance is None else balance.chosen.name,
-        [1.0] * 3 if balance is None else list(balance.chosen.gain),
-        None if balance is None or balance.chosen.sigma is None else list(balance.chosen.sigma),
+        chosen.name,
+        list(chosen.gain),
+        None if chosen.sigma is None else list(chosen.sigma),
         None if balance is None else balance.near_range,
         mapper.scene.range_variance,
         mapper.scene.lightness_over_range,
