@@ -13,9 +13,8 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import refuse_outside, refuse_without_water, view_of_frame
 from aquaflow.mapping.appearance import Grey, choose
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import RESTORED, restored_own
+from aquaflow.mapping.restoration import restored_own, was_restored
 from aquaflow.render.transfers import picture_out
-from aquaflow.water.sightings import SOLID
 from aquaflow.water.white_balance import CAMERA, NEUTRAL
 
 PATCH_PX = 2
@@ -77,8 +76,7 @@ def _grey(dive: Dive, mapper: Mapper, name: str, frame: int, x: float, y: float)
     shown = mapper.show(view)
     own = restored_own(mapper.scene, view, shown)
     rows, columns = (slice(max(0, int(at) - PATCH_PX), int(at) + PATCH_PX + 1) for at in (y, x))
-    known = (shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED)
-    patch = picture_out(known[rows, columns])
+    patch = picture_out(was_restored(view, shown, own)[rows, columns])
     if not patch.any():
         raise InputError(
             f"nothing was restored at {x:g},{y:g} of frame {frame}; choose a grey place that is "

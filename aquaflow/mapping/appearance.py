@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from aquaflow.mapping.restoration import RESTORED, mean_water, restored_own
+from aquaflow.mapping.restoration import mean_water, restored_own, was_restored
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
@@ -25,9 +25,8 @@ from aquaflow.water.illuminant import (
     illuminant_of,
     methods_in,
 )
-from aquaflow.water.sightings import SOLID
 from aquaflow.water.tone import ShownTone, tone_of
-from aquaflow.water.white_balance import NEUTRAL, ChosenWhite
+from aquaflow.water.white_balance import NEUTRAL, ChosenWhite, Recovered
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -127,9 +126,10 @@ def _looks(mapper: Mapper, find_light: bool) -> _Looks:
     said, weights = list[Array](), list[float]()
     for view in spread:
         shown = mapper.show(view)
-        samples.append(seen_and_clear(mapper.scene, view, shown))
+        own = restored_own(mapper.scene, view, shown)
+        samples.append(seen_and_clear(view, shown, own))
         if find_light:
-            picture, weight = _weighted(mapper.scene, view, shown)
+            picture, weight = _weighted(mapper.scene, view, shown, own)
             if (found := methods_in(picture, weight)) is not None:
                 said.append(found)
                 weights.append(float(weight.sum()))
@@ -138,24 +138,21 @@ def _looks(mapper: Mapper, find_light: bool) -> _Looks:
 
 
 @torch.no_grad()
-def seen_and_clear(scene: Scene, view: View, shown: RenderedMap) -> tuple[Array, Array]:
-    """[n, 3] colours of what is solid and was restored rather than filled in, through the water and
-    without it."""
+def seen_and_clear(view: View, shown: RenderedMap, own: Recovered) -> tuple[Array, Array]:
+    """[n, 3] colours of what was restored, through the water and, ``own``, without it."""
     step = max(1, round((shown.alpha.numel() / LOOK_PIXELS) ** 0.5))
     grid = (slice(step // 2, None, step), slice(step // 2, None, step))
-    own = restored_own(scene, view, shown)
-    judged = ((shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED))[grid]
+    judged = was_restored(view, shown, own)[grid]
     seen, clear = shown.image[grid][judged], own.picture[grid][judged]
     return picture_out(seen).astype(np.float64), picture_out(clear).astype(np.float64)
 
 
 def _weighted(
-    scene: Scene, view: View, shown: RenderedMap
+    scene: Scene, view: View, shown: RenderedMap, own: Recovered
 ) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
     """[H, W, 3] the map from the view without its water, and [H, W] how much each pixel says of the
     light: its confidence, less the further away it is than what is nearest."""
-    own = restored_own(scene, view, shown)
-    usable = (shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED)
+    usable = was_restored(view, shown, own)
     usable = usable & torch.isfinite(own.picture).all(dim=-1)
     usable = usable & (shown.image.amax(dim=-1) < CLIPPED)
     near = 0.0 if scene.balance is None else scene.balance.near_range

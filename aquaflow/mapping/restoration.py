@@ -120,6 +120,12 @@ def restored_own(scene: Scene, view: View, shown: RenderedMap) -> Recovered:
     return restored_radiance(scene, shown.radiance / alpha, shown.z, scene.water(view))
 
 
+def was_restored(view: View, shown: RenderedMap, own: Recovered) -> Tensor:
+    """[H, W] bool, where ``own``, the map from the view without its water, is of something solid in
+    the scene, and was restored rather than filled in."""
+    return (shown.alpha > SOLID) & view.scene_mask() & (own.confidence > RESTORED)
+
+
 def to_bytes(
     image: npt.NDArray[np.floating],  # [...] in [0, 1]
 ) -> npt.NDArray[np.uint8]:

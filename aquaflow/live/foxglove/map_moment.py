@@ -16,7 +16,7 @@ from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
 from aquaflow.mapping.appearance import seen_and_clear
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import to_bytes
+from aquaflow.mapping.restoration import restored_own, to_bytes
 from aquaflow.mapping.state import MapCopy, copy_map
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -59,7 +59,8 @@ def take_map_moment(
         seen = SeenFrame(view, view.image, mapper.show(view))
         rendered = to_bytes(picture_out(seen.shown.image))
         if mapper.medium.active:
-            tone = tone_of(*seen_and_clear(mapper.scene, view, seen.shown))
+            own = restored_own(mapper.scene, view, seen.shown)
+            tone = tone_of(*seen_and_clear(view, seen.shown, own))
             restored = without_water(mapper, seen).picture_bytes(tone)[..., :3]
     water = mapper.scene.water(view)
     copy = copy_map(mapper) if points else None
