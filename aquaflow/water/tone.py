@@ -75,6 +75,13 @@ def lightness(
     colours: npt.NDArray[np.floating],  # [..., 3] RGB from 0 to 1, as on a screen (sRGB)
 ) -> Array:
     """[...] L* of CIELAB, from 0 to 100."""
+    return cielab(colours)[..., 0]
+
+
+def cielab(
+    colours: npt.NDArray[np.floating],  # [..., 3] RGB from 0 to 1, as on a screen (sRGB)
+) -> Array:
+    """[..., 3] L* from 0 to 100, a*, b*."""
     flat = np.clip(colours, 0.0, 1.0).astype(np.float32).reshape(1, -1, 3)
-    L = np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2LAB)[0, :, 0], np.float64)
-    return L.reshape(colours.shape[:-1])
+    lab = np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2LAB), np.float64)
+    return lab.reshape(colours.shape)

@@ -20,12 +20,12 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.lab.evaluation.held_out import (
-    Picture,
     held_out_indices,
     read_picture,
     read_range,
     read_restored_area,
 )
+from aquaflow.water.tone import cielab
 
 NEAREST_SHARE = 0.1
 """Share of a view's restored pixels that is compared."""
@@ -99,17 +99,8 @@ def _nearest_colours(dive: Path, index: int) -> npt.NDArray[np.float64] | None:
     if not solid.any():
         return None
     nearest = solid & (z <= np.quantile(z[solid], NEAREST_SHARE))
-    return np.stack([_lab(picture)[nearest].mean(axis=0) for picture in (real, restored)])
-
-
-def _lab(
-    picture: Picture,  # [H, W, 3]
-) -> npt.NDArray[np.float64]:
-    """[H, W, 3] L* from 0 to 100, a*, b*."""
-    import cv2
-
-    unit = picture.astype(np.float32) / np.float32(255.0)
-    return np.asarray(cv2.cvtColor(unit, cv2.COLOR_RGB2LAB), np.float64)
+    pictures = (picture.astype(np.float32) / np.float32(255.0) for picture in (real, restored))
+    return np.stack([cielab(picture)[nearest].mean(axis=0) for picture in pictures])
 
 
 def _angles_deg(
