@@ -134,7 +134,7 @@ def _replay(
     synchronise(run, telemetry)
     run.sources = _sources(run, recording)
     notes = recording.notes + telemetry.notes
-    if run.calibration is not None and run.calibration is not recording.camera:
+    if _is_given(run, recording):
         # What became of one that lies beside the pictures does not matter then.
         unused = sources_of(recording).get("calibration")
         notes = [note for note in notes if note != unused]
@@ -147,9 +147,14 @@ def _sources(run: DiveRun, recording: RecordedCamera) -> dict[str, str]:
     if run.calibration is None:
         assumed = "no calibration: a focal length was assumed and refined"
         stated["calibration"] = "; ".join([*filter(None, [stated.get("calibration")]), assumed])
-    elif run.calibration is not recording.camera:
+    elif _is_given(run, recording):
         stated["calibration"] = "the calibration was given beside the recording"
     return stated
+
+
+def _is_given(run: DiveRun, recording: RecordedCamera) -> bool:
+    """True if the calibration is not the recording's own."""
+    return run.calibration is not None and run.calibration is not recording.camera
 
 
 def _events(run: DiveRun, playback: Playback, source: SourceConfig) -> Iterator[Event]:
