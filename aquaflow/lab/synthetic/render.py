@@ -86,6 +86,9 @@ def render(
         np.empty((height, width), np.bool_),
     )
     rows = max(1, CHUNK_RAYS // (width * supersampling**2))
+    light = None
+    if lamps is not None:
+        light = LampLight.of_camera(lamps, medium, rotation, origin.numpy())
 
     def draw(top: int) -> None:
         part = slice(top, min(top + rows, height))
@@ -93,10 +96,9 @@ def render(
         J = _trace(scene, camera, met, part, supersampling)
         view.clean[part] = _pixel_mean(J, supersampling)
         t, what = met[2:]
-        if lamps is None:
+        if light is None:
             colours = medium.compose(J, t.reshape(J.shape[:2]).numpy())
         else:
-            light = LampLight.of_camera(lamps, medium, rotation, origin.numpy())
             colours = _lit(scene, light, met, J)
         view.water[part] = _pixel_mean(colours, supersampling)
         if supersampling > 1:
