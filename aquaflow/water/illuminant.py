@@ -32,8 +32,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.water.white_balance import Rgb
+
 Array = npt.NDArray[np.float64]
-Rgb = tuple[float, float, float]
 
 MINKOWSKI = 6.0
 """Order of the means: Finlayson and Trezzi's best."""

@@ -9,12 +9,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.medium import Rgb
 from aquaflow.survey.coverage import PageView
 from aquaflow.telemetry.world_frame import SourceReport
 
 FocalSource = Literal["calibrated", "guessed", "refined"]
-
-Rgb = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
