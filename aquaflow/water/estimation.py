@@ -38,13 +38,10 @@ from aquaflow.water.model import (
     Prediction,
     WaterModel,
     rate_rows,
+    with_lamp,
 )
 from aquaflow.water.nearest import Nearest, nearest_of, white_balance
-from aquaflow.water.observations import (
-    Observations,
-    lightness_over_range,
-    variance_over_range,
-)
+from aquaflow.water.observations import Observations, lightness_over_range, variance_over_range
 from aquaflow.water.open_sightings import with_open_water
 from aquaflow.water.sightings import PosedPicture
 from aquaflow.water.white_balance import WhiteBalance
@@ -196,11 +193,6 @@ def _estimate(
         (range_variance[0], range_variance[1]),
         lightness,
     )
-
-
-def with_lamp(models: Sequence[Model]) -> list[Model]:
-    """The same with a lamp, of those in water; most backscatter is the lamp's then, and even."""
-    return [replace(model, lamp=True) for model in models if model.water and not model.uneven]
 
 
 def _lamplit(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[None, None, WaterFit]:

@@ -9,6 +9,7 @@ one vector.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -102,6 +103,11 @@ class Model:
     def takes_open_water(self) -> bool:
         """Shading and unevenness look alike, unless there is open water in view."""
         return self.uneven and self.shading
+
+
+def with_lamp(models: Sequence[Model]) -> list[Model]:
+    """The same with a lamp, of those in water; most backscatter is the lamp's then, and even."""
+    return [replace(model, lamp=True) for model in models if model.water and not model.uneven]
 
 
 @dataclass(frozen=True)
