@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -100,56 +102,43 @@ def test_only_posed_frames_have_a_pose(slam: Slam) -> None:
     assert poses[5].t[0] == 5.0
 
 
+def water_summary(**differs: Any) -> WaterSummary:
+    """A summary of which tests look at some parts."""
+    summary: dict[str, Any] = {
+        "beta_a": [0.4, 0.2, 0.1],
+        "b": [0.3] * 3,
+        "B_inf": [0.1, 0.2, 0.3],
+        "B_res": [0.0] * 3,
+        "d": [1.0] * 3,
+        "range_p5": 0.5,
+        "range_median": 1.0,
+        "range_p95": 2.0,
+        "white_gain": [0.5, 1.0, 1.0],
+        "white_choice": "camera",
+        "chosen_gain": [1.0] * 3,
+        "chosen_gain_sigma": None,
+        "near_range": 0.7,
+        "range_variance": (0.04, 0.01),
+        "lightness_over_range": (0.8, 1.0),
+        "beta_a_sigma": None,
+        "shading": [0.0] * 5,
+        "unevenness": [0.0] * 5,
+        "lamp": None,
+        "exposure": 1.0,
+        "highlight_compression": 0.0,
+    }
+    return WaterSummary(**(summary | differs))
+
+
 def test_a_summary_becomes_the_water_it_describes() -> None:
-    summary = WaterSummary(
-        beta_a=[0.4, 0.2, 0.1],
-        b=[0.3] * 3,
-        B_inf=[0.1, 0.2, 0.3],
-        B_res=[0.0] * 3,
-        d=[1.0] * 3,
-        range_p5=0.5,
-        range_median=1.0,
-        range_p95=2.0,
-        white_gain=[0.5, 1.0, 1.0],
-        white_choice="camera",
-        chosen_gain=[1.0] * 3,
-        chosen_gain_sigma=None,
-        near_range=0.7,
-        range_variance=(0.04, 0.01),
-        lightness_over_range=(0.8, 1.0),
-        beta_a_sigma=None,
-        shading=[0.0] * 5,
-        unevenness=[0.0] * 5,
-        lamp=None,
-        exposure=1.0,
-        highlight_compression=0.0,
-    )
-    water = water_of(summary)
+    water = water_of(water_summary())
     z = torch.tensor([1.0])
     torch.testing.assert_close(water.transmission(z)[0], torch.exp(-torch.tensor([0.4, 0.2, 0.1])))
     assert water.backscatter(z)[0, 2] == pytest.approx(0.3 * (1.0 - np.exp(-0.3)), abs=1e-6)
 
 
 def test_a_lamps_range_is_in_the_unit_of_the_other_ranges() -> None:
-    lamp = Lamp(share=0.7, power=2.0, range=1.5)
-    summary = WaterSummary(
-        **{name: [0.3] * 3 for name in ("beta_a", "b", "B_inf", "B_res", "d", "white_gain")},
-        range_p5=0.5,
-        range_median=1.0,
-        range_p95=2.0,
-        near_range=None,
-        white_choice="camera",
-        chosen_gain=[1.0] * 3,
-        chosen_gain_sigma=None,
-        range_variance=None,
-        lightness_over_range=None,
-        beta_a_sigma=None,
-        shading=[0.0] * 5,
-        unevenness=[0.0] * 5,
-        lamp=lamp,
-        exposure=1.0,
-        highlight_compression=0.0,
-    )
+    summary = water_summary(lamp=Lamp(share=0.7, power=2.0, range=1.5))
     scaled, z = water_in(summary, 2.0), torch.tensor([0.4, 1.5, 3.0])
     assert scaled.lamp == Lamp(share=0.7, power=2.0, range=3.0)
     seen = water_of(summary).transmission(z)
