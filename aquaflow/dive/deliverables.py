@@ -132,7 +132,8 @@ class Deliverables:
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""
         main, attempt = self._main, self._attempt
-        found = attempt("evaluation", lambda: held_out_examples(self.slam, main, until)) or []
+        examined = partial(held_out_examples, self.slam, main, self._poses_m, until)
+        found = attempt("evaluation", examined) or []
         scale = self.metric_frame.T_nm.scale
         self.held_out = [held_out_in(example, scale) for example in found]
         there = len(self.slam.held_out.get(main, ()))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
@@ -27,13 +28,15 @@ def water_in_numbers(mapper: Mapper, most_views: int | None = None) -> WaterSumm
     return map_file.summarise_water(mapper, most_views or map_file.RANGE_VIEWS)
 
 
-def held_out_examples(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
+def held_out_examples(
+    slam: Slam, sub_map: int, poses: Mapping[int, Sim3], until: Deadline | None = None
+) -> list[HeldOut]:
     """See :func:`aquaflow.dive.held_out.examine_held_out`; a sub-map without a map has none."""
     if sub_map not in slam.mappers:
         return []
     from aquaflow.dive.held_out import examine_held_out
 
-    return examine_held_out(slam, sub_map, until)
+    return examine_held_out(slam, sub_map, poses, until)
 
 
 def write_exact(folder: Path, mapper: Mapper, suffix: str = "") -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.held_out_example import Fidelity, HeldOut
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import (
@@ -21,7 +22,7 @@ from aquaflow.mapping.restoration import (
 from aquaflow.mapping.scene import RenderedMap
 from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.render.transfers import picture_out
-from aquaflow.render.views import View
+from aquaflow.render.views import View, in_time
 from aquaflow.slam import Slam
 from aquaflow.water.sightings import SOLID
 from aquaflow.water.tone import ShownTone
@@ -31,13 +32,23 @@ REGISTERING = 0.85
 few (notes/2026-11-speed.md#finishing)."""
 
 
-def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
+def examine_held_out(
+    slam: Slam,
+    sub_map: int,
+    poses: Mapping[int, Sim3],
+    until: Deadline | None = None,
+) -> list[HeldOut]:
     """Render every held-out frame of a sub-map from its refined pose and compare; where there is
-    only time for some ``until`` then, those are spread over the dive."""
+    only time for some ``until`` then, those are spread over the dive.
+
+    ``poses``: T_wc by frame index that they start from, for those that it has.
+    """
     mapper = slam.mappers.get(sub_map)
     if mapper is None or len(mapper.gaussians) == 0:
         return []
-    views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
+    views = in_time(slam.held_out.get(sub_map, []))
+    for view in views:
+        view.T_wc = poses.get(view.frame_index, view.T_wc)
     contain, tone = slam.failures.contain, ShownTone()
     views, as_tracked = _register_views(slam, mapper, views, until or Deadline())
     with contain("restored tone"):
@@ -74,6 +85,7 @@ def _register_views(
             break
         view = views[place]
         with slam.failures.contain("held-out pose", view.frame_index):
+            mapper.take_light(view)
             as_tracked[view.frame_index] = _fidelity(view, mapper.show(view))
             mapper.register(view)
         done.append(place)

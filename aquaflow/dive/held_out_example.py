@@ -40,7 +40,8 @@ class HeldOut:
     amplification: npt.NDArray[np.float32] | None = None
     """[2, 3] RGB, as applied and as allowed (see RestoredPicture)."""
     as_tracked: Fidelity | None = None
-    """Before anything of the view was refined: tracked pose, mean exposure, even light."""
+    """Before its own picture refined its pose: as tracked, moved with the views before and after,
+    whose exposure and light it has."""
 
 
 def mean_amplification(examples: Sequence[HeldOut]) -> tuple[Rgb, Rgb] | None:

@@ -35,6 +35,7 @@ from aquaflow.mapping.optimisation import (
     register,
     sampled_views,
     shuffled_views,
+    take_light,
 )
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.mapping.scene_water import WaterFitting, rebalance
@@ -279,10 +280,15 @@ class Mapper:
         self._take(view)
         return self.scene.show(view)
 
+    def take_light(self, view: View) -> None:
+        """Give a held-out view the exposure and the light of the views before and after."""
+        self._take(view)
+        take_light(view, in_time(self.views))
+
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
         self._take(view)
-        register(view, self.scene, in_time(self.views), self.config.optimiser)
+        register(view, self.scene, self.config.optimiser)
 
     @property
     def neural(self) -> NeuralGaussians | None:

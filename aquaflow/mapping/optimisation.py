@@ -397,20 +397,19 @@ DAMPING = 1e-3
 """Share of the normal matrix's diagonal added to it, for motions that the picture hardly shows."""
 
 
-def register(
+def take_light(
     view: View,
-    scene: Scene,
     mapped: Sequence[View],  # in the order of their frames
-    config: OptimiserConfig,
 ) -> None:
-    """Refine the pose of ``view`` photometrically; it stays where no step fits better.
-
-    Its exposure and its light are those of its neighbours in time: nothing of them is learned from
-    its own picture (the peers do so for exposure).
-    """
+    """Give a view that was never mapped the exposure and the light of its neighbours in time:
+    nothing of them is learned from its own picture (the peers do so for exposure)."""
     if mapped:
         set_log_gain(view, log_gain_at(view.frame_index, mapped))
         view.light = light_at(view.frame_index, mapped)
+
+
+def register(view: View, scene: Scene, config: OptimiserConfig) -> None:
+    """Refine the pose of ``view`` photometrically; it stays where no step fits better."""
     if config.heldout_steps == 0 or len(scene.gaussians) == 0:
         return
     pose = _align(_Picture(view, scene), config.heldout_steps)

@@ -19,7 +19,7 @@ def held_out(amplification: list[list[float]] | None) -> HeldOut:
 
 
 def test_a_dive_without_a_map_has_nothing_to_examine() -> None:
-    assert examine_held_out(Slam(Config.model_validate({})), 0) == []
+    assert examine_held_out(Slam(Config.model_validate({})), 0, {}) == []
 
 
 def test_the_amplification_is_the_mean_over_the_views_that_have_one() -> None:

@@ -16,10 +16,11 @@ from aquaflow.dive.results import (
     WaterSummary,
     largest_sub_map,
     metrics,
+    moved_with,
     refined_poses,
 )
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped, Frame
@@ -100,6 +101,31 @@ def test_only_posed_frames_have_a_pose(slam: Slam) -> None:
     poses = refined_poses(slam, RESULTS)
     assert list(poses) == [0, 1, 4, 5, 6]
     assert poses[5].t[0] == 5.0
+
+
+def test_a_frame_between_two_refined_ones_moves_with_both_in_the_cameras_axes() -> None:
+    turned = Sim3(so3_exp(np.array([0.0, 0.0, 0.5 * np.pi])), np.array([5.0, 0.0, 0.0]), 2.0)
+    tracked = {0: Sim3.identity(), 1: turned, 2: Sim3.identity()}
+    up = Sim3(np.eye(3), np.array([0.2, 0.0, 0.0]))
+    moved = moved_with(tracked, {0: Sim3.identity(), 2: up})
+    np.testing.assert_allclose(moved[1].t, [5.0, 0.1, 0.0], atol=1e-12)  # half of it, along its x
+    np.testing.assert_allclose(moved[1].R, turned.R, atol=1e-12)
+    assert moved[1].scale == 2.0
+    assert moved[2] is up
+
+
+def test_frames_beyond_the_refined_ones_move_with_the_last() -> None:
+    tracked = {index: Sim3.identity() for index in range(3)}
+    aside = Sim3(so3_exp(np.array([0.0, 0.1, 0.0])), np.array([0.0, 0.3, 0.0]))
+    moved = moved_with(tracked, {1: aside})
+    for index in range(3):
+        np.testing.assert_allclose(moved[index].R, aside.R, atol=1e-12)
+        np.testing.assert_allclose(moved[index].t, aside.t, atol=1e-12)
+
+
+def test_without_a_refined_frame_nothing_moves() -> None:
+    tracked = {0: Sim3.identity(), 1: Sim3.identity()}
+    assert moved_with(tracked, {}) == {}
 
 
 def water_summary(**differs: Any) -> WaterSummary:

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+import torch
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config import OptimiserConfig
@@ -133,6 +134,16 @@ def test_registering_moves_the_pose_towards_the_truth_and_nothing_of_the_map() -
     assert same(copied(mapper), before)
     assert mapper.steps == 0
     assert view not in mapper.views
+
+
+def test_a_held_out_view_is_lit_as_its_neighbours_in_time_and_not_as_its_own_picture() -> None:
+    mapper = grown(DRY, count=3)
+    for view, gain in zip(mapper.views, (0.0, 0.2, 0.4), strict=True):
+        view.log_gain = torch.full((3,), gain, dtype=torch.float64)
+    view = filmed(floor(), [pose((0.05, 0.0, 0.0))])[0]
+    view.frame_index = mapper.views[1].frame_index
+    mapper.take_light(view)
+    assert view.log_gain.tolist() == pytest.approx([0.2] * 3)
 
 
 def test_registering_leaves_the_water_alone() -> None:

@@ -42,7 +42,7 @@ TILES = (
     ("gaussians", "{:,.0f}", "Gaussians in the map"),
     ("fps", "{:.2f}", "frames per second"),
     ("psnr", "{:.2f}", "dB PSNR, held-out frames"),
-    ("psnr_as_tracked", "{:.2f}", "dB PSNR, pose and light as tracked"),
+    ("psnr_as_tracked", "{:.2f}", "dB PSNR, pose as tracked"),
     ("ssim", "{:.3f}", "SSIM, held-out frames"),
     ("lpips", "{:.3f}", "LPIPS, held-out frames"),
     ("ate_rmse_m_sim3", "{:.3g}", "path error (ATE, Sim(3))"),
