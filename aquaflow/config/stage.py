@@ -119,6 +119,7 @@ CONSTANTS: dict[str, Any] = {
     "mapping.medium.max_gradient": 0.01,
     "mapping.optimiser.prune_radius_widths": 0.5,
     "mapping.decoder.feature_rate": 4e-3,
+    "mapping.sunlight.columns": 24,
     "service.limits.gpu_memory_share": 0.05,
     "viewer.picture_width": 240,
 }

@@ -42,6 +42,7 @@ from aquaflow.render.views import View
 from aquaflow.water.exposure import log_gains_of, set_log_gain
 from aquaflow.water.model import Lamp
 from aquaflow.water.sightings import SOLID
+from aquaflow.water.sunlight import COLUMNS
 from aquaflow.water.tone import ShownTone, tone_of
 from aquaflow.water.white_balance import ChosenWhite, WhiteBalance
 
@@ -60,7 +61,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "config": mapper.config.model_dump(mode="json"),
         "medium_active": mapper.medium.active,
         "exposes": scene.exposes,
-        "sunlight_plays": scene.sunlight.plays,
+        "sunlight_columns": scene.sunlight.columns,
         "water_evidence": scene.water_evidence,
         "beta_a_sigma": scene.beta_a_sigma,
         "lamp": None if scene.lamp is None else asdict(scene.lamp),
@@ -123,7 +124,8 @@ def deserialise(
     medium = mapper.medium.state_dict() | _under("medium", arrays, device)
     mapper.medium.load_state_dict(medium)
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
-    scene.sunlight.plays = bool(facts["sunlight_plays"])
+    coarse = COLUMNS[0] * facts.get("sunlight_plays", 0)  # in maps written before 2026-11-27
+    scene.sunlight.columns = int(facts.get("sunlight_columns", coarse))
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
     if facts.get("lamp") is not None:  # not in maps written before 2026-11-26
         scene.lamp = Lamp(**facts["lamp"])

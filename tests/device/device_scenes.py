@@ -36,7 +36,7 @@ DECODE = "aquaflow.mapping.neural.decoder"
 ALL_PARTS: dict[str, dict[str, Any]] = {
     "medium": {"enabled": True, "first_fit_views": 6, "fit_views": 6},
     "decoder": {"enabled": True, "local_width": 4, "global_width": 4, "width": 8},
-    "sunlight": {"enabled": True, "columns": 4},
+    "sunlight": {"enabled": True},
     "optimiser": {"poses": 1e-3, "refine_steps": 8, "prune_every": 10, "heldout_steps": 2},
     "insertion": {"density": 0.3},
 }

@@ -42,7 +42,7 @@ def learned(kind: str = "dry") -> Mapper:
     mapper = grown(settings(**copy.deepcopy({**PLAIN, **KINDS[kind]})))
     mapper.optimise(6)
     mapper.scene.shading = np.array([0.0, 0.1, -0.1, 0.0, 0.05])
-    mapper.scene.exposes = mapper.scene.sunlight.plays = True
+    mapper.scene.exposes, mapper.scene.sunlight.columns = True, 12
     for i, view in enumerate(mapper.views):
         view.log_gain = torch.tensor([0.01, 0.0, -0.02], dtype=torch.float64) * i
     mapper.refine()

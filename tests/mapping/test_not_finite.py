@@ -80,7 +80,7 @@ def test_light_and_exposure_stay_what_they_were(monkeypatch: pytest.MonkeyPatch)
     drawn = torch.full((48, 64, 3), 0.4)
     monkeypatch.setattr(torch.Tensor, "log", lambda self: torch.full_like(self, torch.nan))
     learn_gain(view, drawn, SOLID)
-    learn_light(view, drawn, SOLID, 8)
+    learn_light(view, drawn, SOLID)
     assert view.light is not None
     assert bool(torch.isfinite(view.log_gain).all())
     assert bool(torch.isfinite(view.light).all())

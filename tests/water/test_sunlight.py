@@ -12,11 +12,12 @@ from aquaflow.config import SunlightConfig
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View
 from aquaflow.water.sunlight import (
+    COLUMNS,
     FEWEST_VIEWS,
     MAX_LOG_GAIN,
     TOWARDS_ONE,
     Sunlight,
-    is_light,
+    columns_of_light,
     learn_light,
     light_at,
     light_over,
@@ -24,7 +25,6 @@ from aquaflow.water.sunlight import (
 from tests.mapping.mapping_scenes import filmed, floor, path, renderer, settings, view_of
 
 SOLID = torch.ones(48, 64)
-COLUMNS = 8
 LEFT, RIGHT = slice(None, 24), slice(40, None)
 
 
@@ -51,8 +51,8 @@ def swell(count: int, period: float, height: float = 0.1) -> list[View]:
 
 def test_light_is_learned_where_it_falls() -> None:
     view = sunny_on_the_left()
-    learn_light(view, drawn(), SOLID, COLUMNS)
-    gain = light_over(view)
+    learn_light(view, drawn(), SOLID)
+    gain = light_over(view, COLUMNS[-1])
     assert gain is not None
     expected = 1.3 ** (1.0 - TOWARDS_ONE)
     np.testing.assert_allclose(gain[:, LEFT].mean(), expected, atol=0.02)
@@ -62,21 +62,21 @@ def test_light_is_learned_where_it_falls() -> None:
 @pytest.mark.parametrize("what", ["bare", "vehicle", "not finite"])
 def test_a_picture_that_says_nothing_leaves_the_light_as_it_was(what: str) -> None:
     view, picture, alpha = sunny_on_the_left(), drawn(), SOLID.clone()
-    before = view.light = torch.full((3, 6, 8), 0.1)
+    before = view.light = torch.full((3, 18, 24), 0.1)
     if what == "bare":
         alpha[:] = 0.5
     elif what == "vehicle":
         view.mask = np.zeros((48, 64), bool)
     else:
         picture[:] = torch.nan
-    learn_light(view, picture, alpha, COLUMNS)
+    learn_light(view, picture, alpha)
     assert torch.equal(view.light, before)
 
 
 @pytest.mark.parametrize("darkness", [0.0, -0.05])
 def test_the_light_is_bounded_where_the_map_is_black(darkness: float) -> None:
     view = view_of(np.full((48, 64, 3), 240, np.uint8))
-    learn_light(view, torch.full((48, 64, 3), darkness), SOLID, COLUMNS)
+    learn_light(view, torch.full((48, 64, 3), darkness), SOLID)
     assert view.light is not None
     assert float(view.light.abs().max()) <= MAX_LOG_GAIN
 
@@ -91,11 +91,30 @@ def test_a_view_that_was_never_mapped_lies_between_its_neighbours() -> None:
 
 
 def test_fields_that_follow_each_other_are_light_and_random_or_constant_ones_are_not() -> None:
-    assert is_light(swell(40, period=12.0))
-    assert not is_light(swell(40, period=2.2))  # each unlike its neighbours: errors of the map
-    assert not is_light(swell(40, period=12.0, height=0.005))
-    assert not is_light(lit_by(*[0.3] * 40))  # a lamp: the camera's shading
-    assert not is_light(swell(FEWEST_VIEWS - 1, period=12.0))
+    assert columns_of_light(swell(40, period=12.0))
+    assert not columns_of_light(swell(40, period=2.2))  # each unlike its neighbours: errors
+    assert not columns_of_light(swell(40, period=12.0, height=0.005))
+    assert not columns_of_light(lit_by(*[0.3] * 40))  # a lamp: the camera's shading
+    assert not columns_of_light(swell(FEWEST_VIEWS - 1, period=12.0))
+
+
+@pytest.mark.parametrize("finest", COLUMNS)
+def test_light_is_as_fine_as_neighbours_predict_and_no_finer(finest: int) -> None:
+    """Patterns of every fineness; those up to ``finest`` drift, the others are drawn anew."""
+    random = np.random.default_rng(0)
+    patterns = {n: random.normal(size=(2, 3, round(0.75 * n), n)) for n in COLUMNS}
+    views = lit_by(*[0.0] * 60)
+    for i, view in enumerate(views):
+        turn = 2.0 * math.pi * i / 12.0
+        light = torch.zeros(3, 18, 24)
+        for n, (a, b) in patterns.items():
+            drifts = math.cos(turn) * a + math.sin(turn) * b
+            cells = drifts if n <= finest else random.normal(size=a.shape)
+            light += torch.nn.functional.interpolate(
+                0.05 * torch.tensor(cells, dtype=torch.float32)[None], (18, 24)
+            )[0]
+        view.light = light
+    assert columns_of_light(views) == finest
 
 
 def test_without_the_switch_nothing_is_learned_and_nothing_plays() -> None:
@@ -104,7 +123,7 @@ def test_without_the_switch_nothing_is_learned_and_nothing_plays() -> None:
     light.judge(swell(40, period=12.0))
     assert light.over(view, exposure=None) is None
     assert view.light is None
-    assert not light.plays
+    assert light.columns == 0
 
 
 def test_what_plays_is_drawn_and_taken_out_again() -> None:
@@ -154,7 +173,8 @@ def test_a_map_in_playing_light_is_that_of_its_mean() -> None:
         mapper.optimiser.adam.extend(len(true))
         mapper.optimiser.adam.bind(mapper.gaussians.parameters)
         mapper.refine()
-        assert mapper.scene.sunlight.plays is enabled
+        assert (mapper.scene.sunlight.columns > 0) is enabled
+        mapper.take_light(views[10])
         mapper.register(views[10])
         errors[enabled] = float((mapper.show(views[10]).image - views[10].target()).abs().mean())
     assert errors[True] < 0.7 * errors[False]
