@@ -21,6 +21,7 @@ import numpy as np
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors import InputError
+from aquaflow.config.white_balance import DAYLIGHT
 from aquaflow.dive.calibration_pass import FoundCamera
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import IN_SITE, DiveFolder
@@ -44,6 +45,7 @@ from aquaflow.dive.results import (
 )
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow
+from aquaflow.dive.white_balance import depths_below
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.keyframes.place import (
@@ -127,7 +129,16 @@ class Deliverables:
             attempt("water summary", partial(self._summarise_water, sub_map))
 
     def _summarise_water(self, sub_map: int) -> None:
-        self._waters[sub_map] = water_in_numbers(self.slam.mappers[sub_map])
+        mapper = self.slam.mappers[sub_map]
+        wanted = mapper.config.medium.white_balance
+        if wanted.startswith(DAYLIGHT) and mapper.scene.balance is not None:
+            mapper.depths, mapper.tone = depths_below(self._path_rows(), sub_map), None
+            if mapper.depths is None and sub_map == self._main:
+                self.notes.append(
+                    f"no depth below the surface is known, so restored colours have the camera's "
+                    f"white balance and not {wanted}; give --telemetry with depth or pressure"
+                )
+        self._waters[sub_map] = water_in_numbers(mapper)
 
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""

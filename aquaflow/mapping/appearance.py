@@ -8,16 +8,18 @@ map until it is optimised further.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from aquaflow.config.white_balance import DAYLIGHT, NEUTRAL
 from aquaflow.mapping.restoration import mean_water, restored_own, was_restored
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
+from aquaflow.water.daylight import daylight_at
 from aquaflow.water.illuminant import (
     SCENE_ERROR,
     Illuminant,
@@ -26,7 +28,7 @@ from aquaflow.water.illuminant import (
     methods_in,
 )
 from aquaflow.water.tone import ShownTone, tone_of
-from aquaflow.water.white_balance import NEUTRAL, ChosenWhite, Recovered
+from aquaflow.water.white_balance import ChosenWhite, Recovered
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -67,16 +69,17 @@ def shown_tone(mapper: Mapper) -> ShownTone:
 
 
 @torch.no_grad()
-def choose(mapper: Mapper, choice: Literal["camera", "neutral"] | Grey) -> None:
-    """Show the restored colours of a map in water in this white balance from now on; in the
-    camera's, where too little was restored to say what is neutral."""
+def choose(mapper: Mapper, choice: str | Grey) -> None:
+    """Show the restored colours of a map in water in this white balance from now on: one of those
+    that a configuration can name, or that in which a place is grey. In the camera's, where too
+    little was restored to say what is neutral, or daylight is asked for and no depth known."""
     _set_white(mapper.scene, ChosenWhite())
     fitted = mapper.scene.balance is not None
     looks = _looks(mapper, find_light=fitted and choice == NEUTRAL)
     if isinstance(choice, Grey):
         _set_white(mapper.scene, _white_of(mapper, choice.name, _said(choice), choice))
-    elif looks.light is not None:
-        _set_white(mapper.scene, _white_of(mapper, NEUTRAL, looks.light))
+    elif (light := looks.light or _daylight(mapper, choice)) is not None:
+        _set_white(mapper.scene, _white_of(mapper, choice, light))
     gain = np.ones(3) if mapper.scene.balance is None else mapper.scene.balance.chosen.gain
     mapper.tone = (mapper.steps, tone_of(looks.seen, looks.clear * gain))
 
@@ -91,6 +94,16 @@ def _said(grey: Grey) -> Illuminant:
     return Illuminant(log - log.mean(), np.zeros(3))
 
 
+def _daylight(mapper: Mapper, choice: str) -> Illuminant | None:
+    """What a choice of daylight says of the light, in the camera's white balance."""
+    balance, depths = mapper.scene.balance, mapper.depths
+    if balance is None or depths is None or not choice.startswith(DAYLIGHT):
+        return None
+    light = daylight_at(choice.removeprefix(DAYLIGHT), depths)
+    log = light.log + np.log(balance.gain)
+    return Illuminant(log - log.mean(), light.sigma)
+
+
 def _white_of(
     mapper: Mapper, name: str, light: Illuminant, place: Grey | None = None
 ) -> ChosenWhite:
@@ -102,7 +115,7 @@ def _white_of(
     mean = np.multiply(balance.mean, balance.gain)
     z, pixels = (balance.near_range, 1) if place is None else (place.z, place.pixels)
     noise = water_out(balance.noise_of_light(water, z, pixels))
-    assumed = SCENE_ERROR if place is None else 0.0
+    assumed = SCENE_ERROR if name == NEUTRAL else 0.0
     return ChosenWhite(name, *gain_to_grey(light, noise, mean, assumed))
 
 
