@@ -57,6 +57,8 @@ from aquaflow.keyframes.place import (
     depths_at,
     write_places,
 )
+from aquaflow.mapping.appearance import doubt_of_daylight
+from aquaflow.mapping.mapper import Mapper
 from aquaflow.slam import Slam
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
@@ -130,15 +132,23 @@ class Deliverables:
 
     def _summarise_water(self, sub_map: int) -> None:
         mapper = self.slam.mappers[sub_map]
-        wanted = mapper.config.medium.white_balance
-        if wanted.startswith(DAYLIGHT) and mapper.scene.balance is not None:
-            mapper.depths, mapper.tone = depths_below(self._path_rows(), sub_map), None
-            if mapper.depths is None and sub_map == self._main:
-                self.notes.append(
-                    f"no depth below the surface is known, so restored colours have the camera's "
-                    f"white balance and not {wanted}; give --telemetry with depth or pressure"
-                )
+        if mapper.config.medium.white_balance.startswith(DAYLIGHT):
+            self._place_in_daylight(mapper, sub_map)
         self._waters[sub_map] = water_in_numbers(mapper)
+
+    def _place_in_daylight(self, mapper: Mapper, sub_map: int) -> None:
+        """Depths for the white balance of the settings, and a note where they do not serve it."""
+        mapper.depths, mapper.tone = depths_below(self._path_rows(), sub_map), None
+        wanted = mapper.config.medium.white_balance
+        if mapper.scene.balance is None or sub_map != self._main:
+            return
+        if mapper.depths is None:
+            self.notes.append(
+                "no depth below the surface is known, so restored colours have the camera's white "
+                f"balance and not {wanted}; give --telemetry with depth or pressure"
+            )
+        elif (doubt := doubt_of_daylight(mapper, wanted)) is not None:
+            self.notes.append(doubt)
 
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 
@@ -14,11 +15,13 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import refuse_outside, refuse_without_water, view_of_frame
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.mapping.appearance import Grey, choose
+from aquaflow.mapping.appearance import Grey, choose, doubt_of_daylight
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import restored_own, was_restored
 from aquaflow.render.transfers import picture_out
 from aquaflow.water.daylight import Depths
+
+log = logging.getLogger(__name__)
 
 PATCH_PX = 2
 """On each side of the pixel that is said to be grey: a patch of a colour chart has 6 px or more in
@@ -32,6 +35,7 @@ def show_in(dive: Dive, choice: str) -> None:
     of the camera for what was nearest (``camera``), one in which the light of the restored scene is
     grey (``neutral``), or daylight at the dive's depth in water of a type of Jerlov's
     (``daylight:TYPE``), or a pixel of a mapped picture (``FRAME:X,Y``). Its files stay as they are.
+    Daylight that the scene itself contradicts is warned of.
 
     Raises:
         InputError: it is no white balance, there is no such pixel, the map shows nothing there, or
@@ -52,6 +56,8 @@ def show_in(dive: Dive, choice: str) -> None:
     elif name is not None:
         if name.startswith(DAYLIGHT):
             mapper.depths = _depths(dive)
+            if (doubt := doubt_of_daylight(mapper, name)) is not None:
+                log.warning("%s", doubt)
         choose(mapper, name)
         if name == NEUTRAL != mapper.scene.balance.chosen.name:
             raise InputError(

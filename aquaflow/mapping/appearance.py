@@ -39,6 +39,10 @@ LOOKS = 20
 """Views, spread over the dive, that white balance and tone are judged by."""
 LOOK_PIXELS = 4000
 """Of each of them, on a grid: mean lightness to a tenth of a unit."""
+DOUBTFUL = 3.0
+"""Sigmas between daylight as it is said to be and the scene's own estimate: 1.0 and 1.3 on two
+synthetic dives lit so; 3.8 on one that is not, 4.4 on the reef clip, whose camera balanced itself,
+and 3.5 on a hull that is red."""
 CLIPPED = 0.97
 """Seen value from which a channel may be cut off, and then says nothing of the light's colour."""
 
@@ -102,6 +106,26 @@ def _daylight(mapper: Mapper, choice: str) -> Illuminant | None:
     light = daylight_at(choice.removeprefix(DAYLIGHT), depths)
     log = light.log + np.log(balance.gain)
     return Illuminant(log - log.mean(), light.sigma)
+
+
+@torch.no_grad()
+def doubt_of_daylight(mapper: Mapper, choice: str) -> str | None:
+    """A sentence where the light that the restored scene itself shows is hardly that of the
+    ``choice``, before it is chosen; None where it may be, or one of them is not known."""
+    _set_white(mapper.scene, ChosenWhite())
+    said = _daylight(mapper, choice)
+    shown = None if said is None else _looks(mapper, find_light=True).light
+    if said is None or shown is None:
+        return None
+    sigma = np.sqrt(said.sigma**2 + shown.sigma**2 + SCENE_ERROR**2)
+    off = float((np.abs(said.log - shown.log) / sigma).max())
+    if off <= DOUBTFUL:
+        return None
+    return (
+        f"{choice} is {off:.1f} sigma from the light that the scene itself shows: the camera may "
+        "have balanced itself, the water be of another type, or the ground coloured; compare with "
+        f"{NEUTRAL}"
+    )
 
 
 def _white_of(

@@ -78,7 +78,20 @@ def test_an_export_can_be_neutral_and_the_next_is_as_the_dive_was_mapped(
     np.testing.assert_array_equal(again, before)
 
 
-def test_a_scene_by_daylight_of_a_depth_becomes_grey(dive: Path, tmp_path: Path) -> None:
+def test_daylight_that_the_scene_contradicts_is_warned_of(
+    dive: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_map_file(dive / "map.aqf", mapped(light=(1.0, 0.9, 0.8)))
+    row = PoseRow(0, 0.0, None, 0, 0.0, 0.0, 0.0, "m", depth_m=DEPTH_M)
+    write_trajectory_csv(dive / TRAJECTORY_CSV, [row])
+    show_in(Dive(dive), "daylight:oceanic_II")
+    (said,) = caplog.messages
+    assert "sigma from the light that the scene itself shows" in said
+
+
+def test_a_scene_by_daylight_of_a_depth_becomes_grey(
+    dive: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     mapper = mapped(light=daylit_grey(DEPTH_M))
     write_map_file(dive / "map.aqf", mapper)
     poses = [
@@ -95,6 +108,7 @@ def test_a_scene_by_daylight_of_a_depth_becomes_grey(dive: Path, tmp_path: Path)
     assert after.max() / after.min() < 1.1
     chosen = Dive(dive)
     show_in(chosen, "daylight:oceanic_ii")
+    assert not caplog.messages
     assert chosen.white_balance == "daylight:oceanic_II"
     balance = chosen.map().scene.balance
     assert balance is not None
