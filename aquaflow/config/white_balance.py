@@ -40,6 +40,7 @@ def require_name(text: str) -> str:
     found = white_balance_named(text)
     if found is None:
         raise ValueError(
-            f"give {CAMERA}, {NEUTRAL}, or {DAYLIGHT}TYPE, such as {DAYLIGHT}oceanic_II"
+            f"names no white balance; give {CAMERA}, {NEUTRAL}, or {DAYLIGHT}TYPE (such as "
+            f"{DAYLIGHT}oceanic_II)"
         )
     return found

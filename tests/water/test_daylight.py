@@ -56,5 +56,7 @@ def test_the_setting_is_any_case_and_a_wrong_one_names_the_types() -> None:
     assert MediumConfig(white_balance="DayLight:coastal_1c").white_balance == "daylight:coastal_1C"
     with pytest.raises(ValidationError, match=r"oceanic_I, oceanic_IA, .*coastal_9C"):
         MediumConfig(white_balance="daylight:2C")
-    with pytest.raises(ValidationError, match="give camera, neutral, or daylight:TYPE"):
+    with pytest.raises(
+        ValidationError, match="names no white balance; give camera, neutral, or daylight:TYPE"
+    ):
         MediumConfig(white_balance="1:3,4")
