@@ -26,7 +26,7 @@ from aquaflow.dive.calibration_pass import FoundCamera
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import IN_SITE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.dive.from_maps import held_out_examples, water_in_numbers
+from aquaflow.dive.from_maps import held_out_examples, place_in_daylight, water_in_numbers
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -45,7 +45,6 @@ from aquaflow.dive.results import (
 )
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.dive.white_balance import depths_below
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.keyframes.place import (
@@ -57,8 +56,6 @@ from aquaflow.keyframes.place import (
     depths_at,
     write_places,
 )
-from aquaflow.mapping.appearance import doubt_of_daylight
-from aquaflow.mapping.mapper import Mapper
 from aquaflow.slam import Slam
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
@@ -133,22 +130,9 @@ class Deliverables:
     def _summarise_water(self, sub_map: int) -> None:
         mapper = self.slam.mappers[sub_map]
         if mapper.config.medium.white_balance.startswith(DAYLIGHT):
-            self._place_in_daylight(mapper, sub_map)
+            note = place_in_daylight(mapper, self._path_rows(), sub_map)
+            self.notes += [note] if note is not None and sub_map == self._main else []
         self._waters[sub_map] = water_in_numbers(mapper)
-
-    def _place_in_daylight(self, mapper: Mapper, sub_map: int) -> None:
-        """Depths for the white balance of the settings, and a note where they do not serve it."""
-        mapper.depths, mapper.tone = depths_below(self._path_rows(), sub_map), None
-        wanted = mapper.config.medium.white_balance
-        if mapper.scene.balance is None or sub_map != self._main:
-            return
-        if mapper.depths is None:
-            self.notes.append(
-                "no depth below the surface is known, so restored colours have the camera's white "
-                f"balance and not {wanted}; give --telemetry with depth or pressure"
-            )
-        elif (doubt := doubt_of_daylight(mapper, wanted)) is not None:
-            self.notes.append(doubt)
 
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""

@@ -80,6 +80,21 @@ def depths_below(rows: Sequence[PoseRow], sub_map: int) -> Depths | None:
     return Depths(float(np.mean(known)), float(np.std(known))) if known else None
 
 
+def place_in_daylight(mapper: Mapper, rows: Sequence[PoseRow], sub_map: int) -> str | None:
+    """Let the map of a sub-map know its depths, for daylight that its settings ask for; a sentence
+    where that does not serve, or None."""
+    mapper.depths, mapper.tone = depths_below(rows, sub_map), None
+    wanted = mapper.config.medium.white_balance
+    if mapper.scene.balance is None:
+        return None
+    if mapper.depths is None:
+        return (
+            "no depth below the surface is known, so restored colours have the camera's white "
+            f"balance and not {wanted}; give --telemetry with depth or pressure"
+        )
+    return doubt_of_daylight(mapper, wanted)
+
+
 def _depths(dive: Dive) -> Depths:
     found = depths_below(dive.poses, dive.main) if dive.has(TRAJECTORY_CSV) else None
     if found is None:
