@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import aquaflow
+from aquaflow.api.map import Map
+from aquaflow.dive.map_file import read_map_file
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.restoration import mean_water
+from aquaflow.render import select_renderer
+from aquaflow.water.model import Lamp
+from tests.metric_scenes import metric_frame
 
 HASTY = Path(__file__).with_name("hasty.yaml")
 
@@ -107,6 +116,37 @@ def test_a_map_gives_its_gaussians_and_its_medium_as_arrays(small_dive: Path) ->
     assert written is not None
     np.testing.assert_allclose(medium.beta_a, written.beta_a, rtol=1e-4)
     np.testing.assert_allclose(medium.b, written.b, rtol=1e-4)
+
+
+def test_a_medium_has_the_lamps_light_in_its_unit_and_as_the_map_is_drawn(
+    small_dive: Path, tmp_path: Path
+) -> None:
+    mapper = read_map_file(small_dive / "map.aqf", select_renderer("cpu"))
+    mapper.scene.lamp = Lamp(share=0.7, power=2.05, range=1.5)
+    water, metric = mean_water(mapper.scene, mapper.views), metric_frame()
+    assert water is not None
+    medium = Map(mapper, metric).medium
+    assert medium is not None
+    z = np.array([0.01, 0.5, 1.5, 4.0])
+    drawn = water.transmission(torch.tensor(z))
+    found = medium.transmission(metric.T_nm.scale * z)
+    np.testing.assert_allclose(found, drawn.numpy(), rtol=1e-5)
+    assert found[1, 2] > 1.0 > found[3, 2]
+    assert (medium.transmission(np.array([np.inf])) == 0.0).all()
+
+
+def test_a_dive_reads_its_lamp_and_refuses_a_damaged_one(small_dive: Path, tmp_path: Path) -> None:
+    dive = shutil.copytree(small_dive, tmp_path / "dive")
+    facts = json.loads((dive / "medium.json").read_text())
+    lamp = {"share": 0.7, "power": 2.05, "range": 1.5}
+    (dive / "medium.json").write_text(json.dumps(facts | {"lamp": lamp}))
+    medium = aquaflow.read_dive(dive).medium
+    assert medium is not None
+    assert medium.lamp == Lamp(**lamp)
+    for damage in ({"share": 2.0}, {"range": 0.0}, {"power": float("nan")}):
+        (dive / "medium.json").write_text(json.dumps(facts | {"lamp": lamp | damage}))
+        with pytest.raises(aquaflow.AquaFlowError, match="the lamp is no share"):
+            _ = aquaflow.read_dive(dive).medium
 
 
 def test_what_is_done_to_the_arrays_does_not_change_the_map(small_dive: Path) -> None:

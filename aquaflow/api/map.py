@@ -102,7 +102,8 @@ class Map:
 
     @property
     def medium(self) -> Medium | None:
-        """The water, mean over the views, with rates per unit; None if none is modelled."""
+        """The water, mean over the views, with rates per unit, and the light of the vehicle's own
+        lamp; None if none is modelled."""
         with torch.no_grad():
             waters = [w for view in self._mapper.views if (w := self._mapper.scene.water(view))]
         if not waters:
@@ -115,6 +116,7 @@ class Map:
             B_inf=_rgb(first.B_inf),
             B_res=_rgb(first.B_res),
             d=_rgb(first.d / scale),
+            lamp=first.lamp and first.lamp.rescale(scale),
         )
 
     def render(self, T_wc: Sim3, camera: CameraModel | None = None) -> Picture:

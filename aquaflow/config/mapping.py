@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from aquaflow.config.stage import Lab, StageConfig
+from aquaflow.config.white_balance import CAMERA, require_name
 
 
 class WaterPriorsConfig(StageConfig):
@@ -72,10 +73,11 @@ class MediumConfig(StageConfig):
         description="what open water is in restored pictures: as the camera saw it, transparent, "
         "or black",
     )
-    white_balance: Literal["camera", "neutral"] = Field(
-        "camera",
-        description="of restored pictures: as the camera saw what was nearest, or with the light "
-        "of the scene made grey; exports of a dive can have another",
+    white_balance: Annotated[str, AfterValidator(require_name)] = Field(
+        CAMERA,
+        description="of restored pictures: camera (as it saw what was nearest), neutral (the light "
+        "of the scene made grey), or daylight:TYPE (daylight at the dive's depth in water of "
+        "Jerlov's TYPE made grey); exports of a dive can have another",
     )
     initial_attenuation: Lab[float] = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"

@@ -21,11 +21,12 @@ import numpy as np
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors import InputError
+from aquaflow.config.white_balance import DAYLIGHT
 from aquaflow.dive.calibration_pass import FoundCamera
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import IN_SITE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.dive.from_maps import held_out_examples, water_in_numbers
+from aquaflow.dive.from_maps import held_out_examples, place_in_daylight, water_in_numbers
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -127,7 +128,11 @@ class Deliverables:
             attempt("water summary", partial(self._summarise_water, sub_map))
 
     def _summarise_water(self, sub_map: int) -> None:
-        self._waters[sub_map] = water_in_numbers(self.slam.mappers[sub_map])
+        mapper = self.slam.mappers[sub_map]
+        if mapper.config.medium.white_balance.startswith(DAYLIGHT):
+            note = place_in_daylight(mapper, self._path_rows(), sub_map)
+            self.notes += [note] if note is not None and sub_map == self._main else []
+        self._waters[sub_map] = water_in_numbers(mapper)
 
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""

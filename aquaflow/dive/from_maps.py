@@ -6,13 +6,14 @@ map never does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aquaflow.base.clocks.wall import Deadline
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
+from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.world_frame import WorldFrame
 
@@ -26,6 +27,13 @@ def water_in_numbers(mapper: Mapper, most_views: int | None = None) -> WaterSumm
     from aquaflow.dive import map_file
 
     return map_file.summarise_water(mapper, most_views or map_file.RANGE_VIEWS)
+
+
+def place_in_daylight(mapper: Mapper, rows: Sequence[PoseRow], sub_map: int) -> str | None:
+    """See :func:`aquaflow.dive.white_balance.place_in_daylight`."""
+    from aquaflow.dive import white_balance
+
+    return white_balance.place_in_daylight(mapper, rows, sub_map)
 
 
 def held_out_examples(

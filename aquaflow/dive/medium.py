@@ -1,10 +1,8 @@
-"""The water of a dive as plain numbers, and the image formation that they are of.
-
-I = J exp(-beta_a z) + B_inf (1 - exp(-b z)) + B_res exp(-d z), with z the range along the ray.
-"""
+"""The water of a dive as plain numbers, and the image formation that they are of."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.water.model import Lamp
 
 Rgb: TypeAlias = tuple[float, float, float]
 FloatArray: TypeAlias = npt.NDArray[np.floating]
@@ -24,7 +23,12 @@ NAME = "medium.json"
 
 @dataclass(frozen=True)
 class Medium:
-    """Parameters of the image formation, RGB.
+    """Parameters of the image formation, RGB: at range z along the ray a camera sees of radiance J
+
+        J exp(-beta_a z) lit(z) + B_inf (1 - exp(-b z)) + B_res exp(-d z)
+
+    with lit(z) = 1 by daylight, and by a ``lamp`` beside the camera
+    lit(z) = 1 - share + share (range / z)^power exp(-beta_a z).
 
     Lengths are in metres in the truth of a synthetic dive, and in its own unit in a mapped dive.
     """
@@ -39,6 +43,9 @@ class Medium:
     """Near residual of the backscatter, radiance in [0, 1]."""
     d: Rgb
     """Decay of the near residual, 1/m."""
+    lamp: Lamp | None = None
+    """Light from beside the camera: its ``share``, ``power`` and ``range``; None where the dive
+    shows none."""
 
     def looking(
         self,
@@ -68,8 +75,11 @@ class Medium:
         self,
         z: FloatArray,  # [...]
     ) -> FloatArray:
-        """exp(-beta_a z), [..., 3], for ranges z [...] in the unit of length."""
-        return np.asarray(np.exp(-np.asarray(self.beta_a, z.dtype) * z[..., None]))
+        """exp(-beta_a z) lit(z), [..., 3], for ranges z [...] in the unit of length: the share of
+        J that is seen."""
+        beta_a = np.asarray(self.beta_a, z.dtype)
+        T = np.asarray(np.exp(-beta_a * z[..., None]))
+        return T if self.lamp is None else np.asarray(T * self.lamp.light(beta_a, z), z.dtype)
 
     def backscatter(
         self,
@@ -110,10 +120,27 @@ def medium_of(facts: Mapping[str, Any], file: Path) -> Medium | None:
             B_inf=_rgb(scattered["B_inf"]),
             B_res=_rgb(scattered["B_res"]),
             d=_rgb(scattered["d"]),
+            lamp=lamp_of(facts),
         )
     except (ValueError, KeyError, TypeError) as error:
         what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
         raise InputError(f"cannot read the medium {file}: {what}; map the dive again") from error
+
+
+def lamp_of(facts: Mapping[str, Any]) -> Lamp | None:
+    """The lamp that the ``facts`` of ``medium.json`` state, in the unit that they are in; None
+    where there is none, and in dives from before 2026-11-26.
+
+    Raises:
+        ValueError, KeyError, TypeError: they are not a dive's medium.
+    """
+    stated = facts.get("lamp")
+    if stated is None:
+        return None
+    share, power, reference = (float(stated[name]) for name in ("share", "power", "range"))
+    if not (0.0 <= share <= 1.0 and math.isfinite(power) and 0.0 < reference < math.inf):
+        raise DamagedError("the lamp is no share of light, power and range")
+    return Lamp(share, power, reference)
 
 
 def _rgb(value: object) -> Rgb:

@@ -81,7 +81,7 @@ def water_in(water: WaterSummary, scale: float) -> WaterSummary:
         range_median=water.range_median * scale,
         range_p95=water.range_p95 * scale,
         near_range=None if water.near_range is None else water.near_range * scale,
-        lamp=None if water.lamp is None else replace(water.lamp, range=water.lamp.range * scale),
+        lamp=water.lamp and water.lamp.rescale(scale),
     )
 
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from typing import Literal, cast
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from aquaflow.base.errors import InputError
+from aquaflow.config.white_balance import CAMERA, DAYLIGHT, NEUTRAL, white_balance_named
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import refuse_outside, refuse_without_water, view_of_frame
-from aquaflow.mapping.appearance import Grey, choose
+from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
+from aquaflow.dive.trajectory_csv import PoseRow
+from aquaflow.mapping.appearance import Grey, choose, doubt_of_daylight
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import restored_own, was_restored
 from aquaflow.render.transfers import picture_out
-from aquaflow.water.white_balance import CAMERA, NEUTRAL
+from aquaflow.water.daylight import Depths
+
+log = logging.getLogger(__name__)
 
 PATCH_PX = 2
 """On each side of the pixel that is said to be grey: a patch of a colour chart has 6 px or more in
@@ -27,15 +33,17 @@ DARK = 0.02
 def show_in(dive: Dive, choice: str) -> None:
     """Show all restored colours of the dive's largest sub-map in a white balance from now on: that
     of the camera for what was nearest (``camera``), one in which the light of the restored scene is
-    grey (``neutral``), or one in which a pixel of a mapped picture is (``FRAME:X,Y``). Its files
-    stay as they are.
+    grey (``neutral``), or daylight at the dive's depth in water of a type of Jerlov's
+    (``daylight:TYPE``), or a pixel of a mapped picture (``FRAME:X,Y``). Its files stay as they are.
+    Daylight that the scene itself contradicts is warned of.
 
     Raises:
         InputError: it is no white balance, there is no such pixel, the map shows nothing there, or
-            has no water.
+            has no water, or no depth is known of the dive.
         ConfigError: the dive's settings cannot be read.
     """
-    place = None if choice in (CAMERA, NEUTRAL) else _place(choice)
+    name = _name(choice)
+    place = _place(choice) if name is None else None
     mapper = dive.filled_map()
     refuse_without_water(dive, mapper)
     if mapper.scene.balance is None:
@@ -43,16 +51,58 @@ def show_in(dive: Dive, choice: str) -> None:
             f"the water of {dive} was never fitted, so its colours have one white balance only; "
             "leave --white-balance out"
         )
-    if place is None:
-        choose(mapper, cast(Literal["camera", "neutral"], choice))
-        if mapper.scene.balance.chosen.name != choice:
+    if place is not None:
+        choose(mapper, _grey(dive, mapper, choice, *place))
+    elif name is not None:
+        if name.startswith(DAYLIGHT):
+            mapper.depths = _depths(dive)
+            if (doubt := doubt_of_daylight(mapper, name)) is not None:
+                log.warning("%s", doubt)
+        choose(mapper, name)
+        if name == NEUTRAL != mapper.scene.balance.chosen.name:
             raise InputError(
                 f"too little of {dive} was restored to say what is neutral; name something grey as "
                 "FRAME:X,Y"
             )
-    else:
-        choose(mapper, _grey(dive, mapper, choice, *place))
-    dive.white_balance = choice
+    dive.white_balance = name or choice
+
+
+def _name(choice: str) -> str | None:
+    try:
+        return white_balance_named(choice)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def depths_below(rows: Sequence[PoseRow], sub_map: int) -> Depths | None:
+    """Below the surface, of the poses of a sub-map; None where telemetry had none."""
+    known = [row.depth_m for row in rows if row.sub_map == sub_map and row.depth_m is not None]
+    return Depths(float(np.mean(known)), float(np.std(known))) if known else None
+
+
+def place_in_daylight(mapper: Mapper, rows: Sequence[PoseRow], sub_map: int) -> str | None:
+    """Let the map of a sub-map know its depths, for daylight that its settings ask for; a sentence
+    where that does not serve, or None."""
+    mapper.depths, mapper.tone = depths_below(rows, sub_map), None
+    wanted = mapper.config.medium.white_balance
+    if mapper.scene.balance is None:
+        return None
+    if mapper.depths is None:
+        return (
+            "no depth below the surface is known, so restored colours have the camera's white "
+            f"balance and not {wanted}; give --telemetry with depth or pressure"
+        )
+    return doubt_of_daylight(mapper, wanted)
+
+
+def _depths(dive: Dive) -> Depths:
+    found = depths_below(dive.poses, dive.main) if dive.has(TRAJECTORY_CSV) else None
+    if found is None:
+        raise InputError(
+            f"{dive} has no depth below the surface, on which the colour of daylight depends; map "
+            f"it with --telemetry and a log of depth or pressure, or choose {NEUTRAL}"
+        )
+    return found
 
 
 def _place(text: str) -> tuple[int, float, float]:
@@ -65,7 +115,8 @@ def _place(text: str) -> tuple[int, float, float]:
     except ValueError:
         pass
     raise InputError(
-        f"{text[:80]!r} is no white balance; give camera, neutral, or FRAME:X,Y of something grey"
+        f"{text[:80]!r} is no white balance; give {CAMERA}, {NEUTRAL}, {DAYLIGHT}TYPE (such as "
+        f"{DAYLIGHT}oceanic_II), or FRAME:X,Y of something grey"
     )
 
 

@@ -8,16 +8,18 @@ map until it is optimised further.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from aquaflow.config.white_balance import DAYLIGHT, NEUTRAL
 from aquaflow.mapping.restoration import mean_water, restored_own, was_restored
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
+from aquaflow.water.daylight import daylight_at
 from aquaflow.water.illuminant import (
     SCENE_ERROR,
     Illuminant,
@@ -26,7 +28,7 @@ from aquaflow.water.illuminant import (
     methods_in,
 )
 from aquaflow.water.tone import ShownTone, tone_of
-from aquaflow.water.white_balance import NEUTRAL, ChosenWhite, Recovered
+from aquaflow.water.white_balance import ChosenWhite, Recovered
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -37,6 +39,10 @@ LOOKS = 20
 """Views, spread over the dive, that white balance and tone are judged by."""
 LOOK_PIXELS = 4000
 """Of each of them, on a grid: mean lightness to a tenth of a unit."""
+DOUBTFUL = 3.0
+"""Sigmas between daylight as it is said to be and the scene's own estimate: 1.0 and 1.3 on two
+synthetic dives lit so; 3.8 on one that is not, 4.4 on the reef clip, whose camera balanced itself,
+and 3.5 on a hull that is red."""
 CLIPPED = 0.97
 """Seen value from which a channel may be cut off, and then says nothing of the light's colour."""
 
@@ -67,16 +73,17 @@ def shown_tone(mapper: Mapper) -> ShownTone:
 
 
 @torch.no_grad()
-def choose(mapper: Mapper, choice: Literal["camera", "neutral"] | Grey) -> None:
-    """Show the restored colours of a map in water in this white balance from now on; in the
-    camera's, where too little was restored to say what is neutral."""
+def choose(mapper: Mapper, choice: str | Grey) -> None:
+    """Show the restored colours of a map in water in this white balance from now on: one of those
+    that a configuration can name, or that in which a place is grey. In the camera's, where too
+    little was restored to say what is neutral, or daylight is asked for and no depth known."""
     _set_white(mapper.scene, ChosenWhite())
     fitted = mapper.scene.balance is not None
     looks = _looks(mapper, find_light=fitted and choice == NEUTRAL)
     if isinstance(choice, Grey):
         _set_white(mapper.scene, _white_of(mapper, choice.name, _said(choice), choice))
-    elif looks.light is not None:
-        _set_white(mapper.scene, _white_of(mapper, NEUTRAL, looks.light))
+    elif (light := looks.light or _daylight(mapper, choice)) is not None:
+        _set_white(mapper.scene, _white_of(mapper, choice, light))
     gain = np.ones(3) if mapper.scene.balance is None else mapper.scene.balance.chosen.gain
     mapper.tone = (mapper.steps, tone_of(looks.seen, looks.clear * gain))
 
@@ -91,6 +98,36 @@ def _said(grey: Grey) -> Illuminant:
     return Illuminant(log - log.mean(), np.zeros(3))
 
 
+def _daylight(mapper: Mapper, choice: str) -> Illuminant | None:
+    """What a choice of daylight says of the light, in the camera's white balance."""
+    balance, depths = mapper.scene.balance, mapper.depths
+    if balance is None or depths is None or not choice.startswith(DAYLIGHT):
+        return None
+    light = daylight_at(choice.removeprefix(DAYLIGHT), depths)
+    log = light.log + np.log(balance.gain)
+    return Illuminant(log - log.mean(), light.sigma)
+
+
+@torch.no_grad()
+def doubt_of_daylight(mapper: Mapper, choice: str) -> str | None:
+    """A sentence where the light that the restored scene itself shows is hardly that of the
+    ``choice``, before it is chosen; None where it may be, or one of them is not known."""
+    _set_white(mapper.scene, ChosenWhite())
+    said = _daylight(mapper, choice)
+    shown = None if said is None else _looks(mapper, find_light=True).light
+    if said is None or shown is None:
+        return None
+    sigma = np.sqrt(said.sigma**2 + shown.sigma**2 + SCENE_ERROR**2)
+    off = float((np.abs(said.log - shown.log) / sigma).max())
+    if off <= DOUBTFUL:
+        return None
+    return (
+        f"{choice} is {off:.1f} sigma from the light that the scene itself shows: the camera may "
+        "have balanced itself, the water be of another type, or the ground coloured; compare with "
+        f"{NEUTRAL}"
+    )
+
+
 def _white_of(
     mapper: Mapper, name: str, light: Illuminant, place: Grey | None = None
 ) -> ChosenWhite:
@@ -102,7 +139,7 @@ def _white_of(
     mean = np.multiply(balance.mean, balance.gain)
     z, pixels = (balance.near_range, 1) if place is None else (place.z, place.pixels)
     noise = water_out(balance.noise_of_light(water, z, pixels))
-    assumed = SCENE_ERROR if place is None else 0.0
+    assumed = SCENE_ERROR if name == NEUTRAL else 0.0
     return ChosenWhite(name, *gain_to_grey(light, noise, mean, assumed))
 
 

@@ -42,6 +42,7 @@ from aquaflow.mapping.scene_water import WaterFitting, rebalance
 from aquaflow.render.contract import Renderer
 from aquaflow.render.gsplat import give_back_after
 from aquaflow.render.views import View, in_time
+from aquaflow.water.daylight import Depths
 from aquaflow.water.medium import LearnedMedium
 from aquaflow.water.tone import ShownTone
 
@@ -75,6 +76,8 @@ class Mapper:
         self.views: list[View] = []
         self.tone: tuple[int, ShownTone] | None = None
         """Of restored pictures, and at how many steps it was judged (appearance.py)."""
+        self.depths: Depths | None = None
+        """Below the surface; None where they are not known."""
         self._failed_in_a_row = 0
         """Steps that raised, since the last one that did not."""
         if config.decoder.enabled:

@@ -306,6 +306,8 @@ class MapCopy:
     """[N, 3] without water, as shown in ``tone``."""
     water: npt.NDArray[np.float32] | None
     """[6, 3] beta, B_inf, b, B_res, d as the last camera sees it, and the gain of ``clear``."""
+    lamp: Lamp | None
+    """Light from beside the camera."""
     tone: ShownTone
     """Judged by the Gaussians: of a map that grows, no view stands for all."""
     views: list[Sim3]
@@ -325,7 +327,7 @@ def copy_map(mapper: Mapper) -> MapCopy:
         rows = map_out(torch.cat([water.stack(), mapper.scene.white_gain()[None]]))
     steps = map_out(mapper.optimiser.adam.steps)
     poses = [each.T_wc for each in mapper.views]
-    return MapCopy(plain, steps, clear, rows, tone, poses)
+    return MapCopy(plain, steps, clear, rows, mapper.scene.lamp, tone, poses)
 
 
 def _toned(

@@ -121,7 +121,30 @@ class Lamp:
     share: float
     power: float
     range: float
-    """Map units."""
+    """In the unit of length that rates are per."""
+
+    def beam(
+        self,
+        beta_a: npt.NDArray[np.floating],  # [3] attenuation
+        z: npt.NDArray[np.floating],  # [...]
+    ) -> Array:
+        """[..., 3] light of the lamp on what is seen at range z."""
+        nearer = np.log(self.range) - np.log(np.maximum(z, NEAREST_LIT * self.range))
+        return np.asarray(
+            self.share * np.exp(self.power * nearer[..., None] - beta_a * z[..., None])
+        )
+
+    def light(
+        self,
+        beta_a: npt.NDArray[np.floating],  # [3] attenuation
+        z: npt.NDArray[np.floating],  # [...]
+    ) -> Array:
+        """[..., 3] all light on what is seen at range z, over that in which J is its colour."""
+        return 1.0 - self.share + self.beam(beta_a, z)
+
+    def rescale(self, times: float) -> Lamp:
+        """The same lamp in another unit of length, ``times`` of which are one of before."""
+        return replace(self, range=times * self.range)
 
 
 NEAREST_LIT = 0.1
@@ -156,17 +179,7 @@ class Trial:
     ) -> Array:
         """[..., 3] share of J that is seen."""
         T = np.exp(-self.beta_a * z[..., None])
-        return T if self.lamp is None else T * (1.0 - self.lamp.share + self.beam(z))
-
-    def beam(
-        self,
-        z: Array,  # [...]
-    ) -> Array:
-        """[..., 3] light of the lamp on what is seen."""
-        assert self.lamp is not None
-        nearer = np.log(self.lamp.range / np.maximum(z, NEAREST_LIT * self.lamp.range))
-        log_light = self.lamp.power * nearer[..., None] - self.beta_a * z[..., None]
-        return np.asarray(self.lamp.share * np.exp(log_light))
+        return T if self.lamp is None else T * self.lamp.light(self.beta_a, z)
 
 
 class WaterUnknowns:
@@ -455,7 +468,7 @@ class WaterModel(WaterUnknowns):
             passed = np.exp(-b * seen.z)
             path = seen.z
             if trial.lamp is not None:
-                beam = trial.beam(seen.z)[:, c]
+                beam = trial.lamp.beam(trial.beta_a, seen.z)[:, c]
                 lit_by = 1.0 - trial.lamp.share + beam
                 path = path * (1.0 + beam / lit_by)
             direct += [-beta_a * path * light, water_gain * B_inf * b * seen.z * passed]

@@ -34,11 +34,11 @@ whatever the pixel is: less light is amplified more only until it drowns in the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from aquaflow.config.white_balance import CAMERA
 from aquaflow.render.transfers import water_in
 from aquaflow.water.medium import MAX_RESTORED, WaterParameters
 
@@ -56,10 +56,6 @@ LEAST_LIGHT = 1e-6
 """Share of full scale: guards the division where no light comes back."""
 
 Rgb = tuple[float, float, float]
-CAMERA: Literal["camera"] = "camera"
-NEUTRAL: Literal["neutral"] = "neutral"
-"""Names of white balances: that of the camera for what was nearest, and that in which the light of
-the restored scene is grey."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,7 @@ class ChosenWhite:
     """A white balance that was asked for, on top of the camera's."""
 
     name: str = CAMERA
-    """``camera``, ``neutral`` or the ``FRAME:X,Y`` that was said to be grey."""
+    """``camera``, ``neutral``, ``daylight:TYPE`` or the ``FRAME:X,Y`` that was said to be grey."""
     gain: Rgb = (1.0, 1.0, 1.0)
     """RGB; the scene's mean luminance stays."""
     sigma: Rgb | None = None

@@ -31,6 +31,8 @@ from aquaflow.sources.preprocessing import Preparation
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import Frame, UtcTime
+from aquaflow.water.daylight import Depths
+from aquaflow.water.white_balance import WhiteBalance
 from tests.metric_scenes import SCALE, SHIFT, TURN, metric_frame
 
 SETTINGS = load_config(Path(__file__).parents[1] / "hasty.yaml")
@@ -234,6 +236,33 @@ def test_a_pose_of_a_sub_map_that_no_frame_is_known_for_stays(slam: Slam, tmp_pa
     first = slam.results()[0].T_wc
     assert isinstance(first, Sim3)
     assert made.poses[0] is first or np.array_equal(made.poses[0].t, first.t)
+
+
+def test_daylight_in_the_settings_is_of_the_dives_depth_and_missed_where_none_is_known(
+    slam: Slam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper = slam.mappers[0]
+    medium = mapper.config.medium.model_copy(update={"white_balance": "daylight:oceanic_II"})
+    config = mapper.config.model_copy(update={"medium": medium})
+    monkeypatch.setattr(mapper, "config", config)
+    monkeypatch.setattr(mapper.scene, "balance", WhiteBalance(1.0, (0.4,) * 3, (1.0,) * 3, 0.1))
+    monkeypatch.setattr(mapper, "tone", None)
+    monkeypatch.setattr(mapper, "depths", None)
+
+    def summarised(outputs: MetricOutputs) -> tuple[str, list[str]]:
+        folder = DiveFolder(tmp_path / f"dive_{outputs.navigation.depth_m_at(0)}", slam.config)
+        made = Deliverables("d", folder, slam, slam.results(), None, outputs)
+        made.summarise()
+        folder.close()
+        assert mapper.scene.balance is not None
+        return mapper.scene.balance.chosen.name, made.notes
+
+    name, notes = summarised(MetricOutputs())
+    assert name == "camera"
+    assert "no depth below the surface is known" in notes[0]
+    deep = Navigation(depth_m_at=lambda _: 12.0)
+    assert summarised(MetricOutputs(navigation=deep)) == ("daylight:oceanic_II", [])
+    assert mapper.depths == Depths(12.0, 0.0)
 
 
 def test_numbers_say_when_the_dive_began_if_a_clock_was_heard() -> None:

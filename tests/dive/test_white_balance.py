@@ -22,6 +22,8 @@ from aquaflow.dive.placement import placement
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.point_cloud import read_splats
 from aquaflow.dive.results import medium_json
+from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
+from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
 from aquaflow.dive.white_balance import show_in
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.restoration import restored_gaussians
@@ -30,6 +32,9 @@ from aquaflow.survey.viewer.finished import in_chosen_white
 from aquaflow.survey.viewer.seen_water import water_of
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.mapping.grey_floor import CAST, mapped
+from tests.water.daylit import daylit_grey
+
+DEPTH_M = 12.0
 
 
 @pytest.fixture
@@ -71,6 +76,45 @@ def test_an_export_can_be_neutral_and_the_next_is_as_the_dive_was_mapped(
     assert neutral.max() / neutral.min() < 1.15
     again = pixel(exported(dive, tmp_path / "c", "--white-balance", "camera"), 0, 30, 20)
     np.testing.assert_array_equal(again, before)
+
+
+def test_daylight_that_the_scene_contradicts_is_warned_of(
+    dive: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_map_file(dive / "map.aqf", mapped(light=(1.0, 0.9, 0.8)))
+    row = PoseRow(0, 0.0, None, 0, 0.0, 0.0, 0.0, "m", depth_m=DEPTH_M)
+    write_trajectory_csv(dive / TRAJECTORY_CSV, [row])
+    show_in(Dive(dive), "daylight:oceanic_II")
+    (said,) = caplog.messages
+    assert "sigma from the light that the scene itself shows" in said
+
+
+def test_a_scene_by_daylight_of_a_depth_becomes_grey(
+    dive: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mapper = mapped(light=daylit_grey(DEPTH_M))
+    write_map_file(dive / "map.aqf", mapper)
+    poses = [
+        PoseRow(i, 0.1 * i, None, 0, 0.0, 0.0, 0.0, "m", depth_m=DEPTH_M + side)
+        for i, side in enumerate((-0.5, 0.5, 0.0))
+    ]
+    elsewhere = PoseRow(3, 0.3, None, 1, 0.0, 0.0, 0.0, "m", depth_m=90.0)
+    unknown = PoseRow(4, 0.4, None, 0, 0.0, 0.0, 0.0, "m")
+    write_trajectory_csv(dive / TRAJECTORY_CSV, [*poses, elsewhere, unknown])
+    before = pixel(exported(dive, tmp_path / "a"), 0, 30, 20)
+    assert before.max() / before.min() > 1.5
+    asked = ("--white-balance", "Daylight:OCEANIC_ii")
+    after = pixel(exported(dive, tmp_path / "b", *asked), 0, 30, 20)
+    assert after.max() / after.min() < 1.1
+    chosen = Dive(dive)
+    show_in(chosen, "daylight:oceanic_ii")
+    assert not caplog.messages
+    assert chosen.white_balance == "daylight:oceanic_II"
+    balance = chosen.map().scene.balance
+    assert balance is not None
+    assert balance.chosen.name == "daylight:oceanic_II"
+    assert balance.chosen.sigma is not None
+    assert all(0.01 < sigma < 0.2 for sigma in balance.chosen.sigma)
 
 
 def test_gaussians_are_exported_as_the_pictures_are(dive: Path) -> None:
@@ -127,7 +171,9 @@ def test_a_browser_shows_the_white_balance_that_was_chosen_and_knows_that_of_the
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ("sepia", "'sepia' is no white balance; give camera, neutral, or FRAME:X,Y"),
+        ("sepia", "'sepia' is no white balance; give camera, neutral, daylight:TYPE .*, or FRAME"),
+        ("daylight:4D", "'daylight:4D' names no water type .* oceanic_I, .*, coastal_9C"),
+        ("daylight:oceanic_II", "no depth below the surface.*map it with --telemetry"),
         ("1:3", "is no white balance"),
         ("x:3,4", "is no white balance"),
         ("1:nan,4", "is no white balance"),

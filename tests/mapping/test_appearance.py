@@ -21,10 +21,12 @@ from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
 from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.water.daylight import Depths
 from aquaflow.water.illuminant import LUMINANCE
 from aquaflow.water.tone import ShownTone, lightness
 from tests.mapping.grey_floor import CAST, mapped
 from tests.mapping.mapping_scenes import renderer
+from tests.water.daylit import daylit_grey
 
 
 def restored_of(mapper: Mapper) -> np.ndarray:
@@ -63,6 +65,33 @@ def test_the_settings_of_the_map_choose_first() -> None:
         stated["gain"], np.multiply(CAST, stated["white_balance"]["gain"]), rtol=1e-6
     )
     assert all(0.0 < sigma < 0.3 for sigma in stated["white_balance"]["sigma"])
+
+
+def test_daylight_chosen_by_the_settings_waits_for_a_depth() -> None:
+    mapper = mapped("DAYLIGHT:oceanic_II", light=daylit_grey(12.0))
+    assert mapper.config.medium.white_balance == "daylight:oceanic_II"
+    shown_tone(mapper)
+    assert mapper.scene.balance is not None
+    assert mapper.scene.balance.chosen.name == "camera"
+    mapper.depths, mapper.tone = Depths(12.0, 0.5), None
+    shown_tone(mapper)
+    assert mapper.scene.balance.chosen.name == "daylight:oceanic_II"
+    after = restored_of(mapper).mean(axis=0)
+    assert after.max() / after.min() < 1.1
+
+
+def test_a_channel_that_daylight_left_nothing_of_is_not_amplified() -> None:
+    gains = []
+    for red in (0.4, 0.004):
+        mapper = mapped(light=daylit_grey(30.0))
+        assert mapper.scene.balance is not None
+        mapper.scene.balance = replace(mapper.scene.balance, mean=(red, 0.4, 0.4))
+        mapper.depths = Depths(30.0, 0.5)
+        choose(mapper, "daylight:oceanic_II")
+        red_gain, green_gain, _ = mapper.scene.balance.chosen.gain
+        gains.append(red_gain / green_gain)
+    assert gains[0] > 2.0
+    assert gains[1] < 1.2
 
 
 def test_everything_that_shows_restored_colours_has_the_same_white_balance() -> None:

@@ -193,7 +193,8 @@ def recovered_water(dive: Dive, metres_per_unit: float) -> tuple[Medium, bool]:
         return found, True
     per_metre = 1.0 / metres_per_unit
     rates = {name: _times(getattr(found, name), per_metre) for name in ("beta_a", "b", "d")}
-    return replace(found, **rates), True
+    lamp = found.lamp and found.lamp.rescale(metres_per_unit)
+    return replace(found, **rates, lamp=lamp), True
 
 
 def _times(colour: Rgb, factor: float) -> Rgb:

@@ -13,7 +13,7 @@ chosen: the colour of the open water follows the channel that travels furthest.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +56,10 @@ WATER_TYPES: dict[WaterType, Medium] = {
 """From no water at all to green coastal water; keys are the names that the config accepts."""
 
 
+_WRITTEN = ("beta_a", "b", "B_inf", "B_res", "d")
+"""Of a medium; lamps of a synthetic dive have a truth of their own (lamps.py)."""
+
+
 def save_medium(medium: Medium, path: Path) -> None:
     """Write the parameters with their units."""
     data: dict[str, object] = {
@@ -70,7 +74,7 @@ def save_medium(medium: Medium, path: Path) -> None:
         },
         "channels": "RGB",
     }
-    data.update({name: [float(v) for v in value] for name, value in asdict(medium).items()})
+    data.update({name: [float(v) for v in getattr(medium, name)] for name in _WRITTEN})
     path.write_text(yaml.safe_dump(data, sort_keys=False))
 
 
@@ -82,8 +86,8 @@ def load_medium(path: Path) -> Medium:
     """
     try:
         data = read_mapping(path, "water", "write the dive again")
-        rows = {name: tuple(map(float, data[name])) for name in Medium.__dataclass_fields__}
-        return Medium(**{name: _rgb_of(row) for name, row in rows.items()})
+        beta_a, b, B_inf, B_res, d = (_rgb_of(data[name]) for name in _WRITTEN)
+        return Medium(beta_a, b, B_inf, B_res, d)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path} does not hold the water's parameters ({reason_of(error)}); write the dive "
@@ -91,6 +95,6 @@ def load_medium(path: Path) -> Medium:
         ) from error
 
 
-def _rgb_of(row: tuple[float, ...]) -> Rgb:
-    red, green, blue = row
+def _rgb_of(row: Iterable[float]) -> Rgb:
+    red, green, blue = map(float, row)
     return red, green, blue

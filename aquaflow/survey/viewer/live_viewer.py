@@ -272,7 +272,7 @@ def _water(copy: MapCopy) -> SeenWater | None:
         tone = copy.tone
         return seen_water(
             beta, B_inf, b, B_res, d, tone.exposure * gain, float(np.median(away)),
-            tone.compression, shown_compression=tone.compression,
+            tone.compression, shown_compression=tone.compression, lamp=copy.lamp,
         )  # fmt: skip
     except ValueError:
         return None

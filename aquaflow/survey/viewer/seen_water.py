@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.errors import DamagedError
+from aquaflow.dive.medium import lamp_of
+from aquaflow.water.model import Lamp
 
 RGB = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class SeenWater:
-    """Image formation of one dive (paper, Eq. 12 and 15), rates per unit of the map."""
+    """Image formation of one dive (:class:`aquaflow.dive.medium.Medium`), rates per unit of the
+    map."""
 
     beta: RGB
     """Attenuation."""
@@ -34,6 +37,9 @@ class SeenWater:
     chosen since."""
     shown_compression: float
     """Of the highlights that it shows."""
+    lamp: RGB
+    """Light from beside the eye (:class:`aquaflow.water.model.Lamp`): share, power, range; a share
+    of 0 where there is none."""
 
     def to_json(self) -> dict[str, Any]:
         """The water by the names that the page uses."""
@@ -58,7 +64,7 @@ def water_of(medium: dict[str, Any]) -> SeenWater | None:
             medium["attenuation_per_unit"], veil["B_inf"], veil["b"], veil["B_res"], veil["d"],
             before[0] * np.asarray(restored["gain"], np.float64),
             medium["map_ply_reference_range"],
-            before[1], np.full(3, after[0]), after[1],
+            before[1], np.full(3, after[0]), after[1], lamp_of(medium),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DamagedError(f"its water is no set of numbers ({error})") from error
@@ -67,6 +73,7 @@ def water_of(medium: dict[str, Any]) -> SeenWater | None:
 def seen_water(
     beta: Any, B_inf: Any, b: Any, B_res: Any, d: Any, gain: Any, range_: Any,
     compression: float = 0.0, white: Any = (1.0, 1.0, 1.0), shown_compression: float = 0.0,
+    lamp: Lamp | None = None,
 ) -> SeenWater:  # fmt: skip
     """The water from anything that is three numbers each.
 
@@ -80,8 +87,9 @@ def seen_water(
         raise ValueError("a number of the water is not finite")
     if min(parts[5].min(), parts[6].min(), range_) <= 0 or min(single[1:]) < 0:
         raise ValueError("a number of the water is not positive")
+    lit = (0.0, 0.0, 1.0) if lamp is None else (lamp.share, lamp.power, lamp.range)
     of = [(float(part[0]), float(part[1]), float(part[2])) for part in parts]
     return SeenWater(
         of[0], of[1], of[2], of[3], of[4], of[5], float(range_), float(compression), of[6],
-        float(shown_compression),
+        float(shown_compression), lit,
     )  # fmt: skip

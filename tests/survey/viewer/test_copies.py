@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.state import MapCopy
 from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.live_viewer import pack_for_browser
+from aquaflow.water.model import Lamp
 from aquaflow.water.tone import ShownTone
 
 
@@ -22,7 +24,8 @@ def copied(count: int) -> MapCopy:
     }  # fmt: skip
     plain = {name: values.astype(np.float32) for name, values in parameters.items()}
     clear = np.full((count, 3), 0.5, np.float32)
-    return MapCopy(plain, np.ones(count, np.int32), clear, None, ShownTone(), [Sim3.identity()])
+    steps = np.ones(count, np.int32)
+    return MapCopy(plain, steps, clear, None, None, ShownTone(), [Sim3.identity()])
 
 
 def test_gaussians_are_coloured_by_the_plan_of_their_sub_map() -> None:
@@ -30,6 +33,14 @@ def test_gaussians_are_coloured_by_the_plan_of_their_sub_map() -> None:
     splats, _, palettes = pack_for_browser(copied(50), 50, plan=plan)
     assert palettes[COVERAGE] == CLASSES
     assert np.array_equal(splats.levels[COVERAGE], np.where(splats.centres[:, 0] > 0.0, 3, 1))
+
+
+def test_a_live_map_is_shown_by_its_lamp() -> None:
+    rows = np.full((6, 3), 0.3, np.float32)
+    lit = replace(copied(50), water=rows, lamp=Lamp(share=0.7, power=2.05, range=1.5))
+    _, water, _ = pack_for_browser(lit, 50)
+    assert water is not None
+    assert water.lamp == (0.7, 2.05, 1.5)
 
 
 def test_without_a_plan_no_coverage_is_shown() -> None:

@@ -157,6 +157,7 @@ export class Drawing {
     for (const name of ["beta", "b", "d"]) three(name, water ? water[name] : [0, 0, 0]);
     three("Binf", water ? water.B_inf : [0, 0, 0]);
     three("Bres", water ? water.B_res : [0, 0, 0]);
+    three("lamp", water ? water.lamp : [0, 0, 1]);
     for (const name of ["gain", "white"]) three(name, water ? water[name] : [1, 1, 1]);
     gl.uniform1f(this.at("compression"), water ? water.compression : 0);
     gl.uniform1f(this.at("shownCompression"), water ? water.shown_compression : 0);

@@ -6,7 +6,7 @@ precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D data; uniform sampler2D palette;
 uniform mat3 axes; uniform vec3 place; uniform vec2 focal, centre, size;
 uniform vec3 middle, extent; uniform vec2 logScales; uniform float brightest, grown, nearest;
-uniform vec3 beta, Binf, b, Bres, d, gain, white; uniform float water, through, compression, shownCompression;
+uniform vec3 beta, Binf, b, Bres, d, gain, white, lamp; uniform float water, through, compression, shownCompression;
 uniform int level, rangeLevel; uniform float within;
 in vec2 corner; in uint index;
 out vec4 colour; out vec2 at;
@@ -33,11 +33,15 @@ vec3 toned(vec3 bright, float c) {
   return min(bright, 0.8) + above / max(1.0 + c * above, 0.02);
 }
 
+// lamp: share of the light, power and range (aquaflow/water/model.py); its light comes as the water does.
 vec3 throughWater(vec3 clear, float range) {
-  float z = min(range, through) * water;
+  float far = min(range, through), z = far * water;
+  vec3 T = exp(-beta * z);
+  vec3 beam = lamp.x * pow(lamp.z / max(far, 0.1 * lamp.z), lamp.y) * T;
+  vec3 seen = T * (1.0 + water * (beam - lamp.x));
   vec3 veil = Binf * (1.0 - exp(-b * z)) + water * Bres * exp(-d * z);
   vec3 restored = toned(clear, -compression) * pow(white, vec3(1.0 - water)) * pow(gain, vec3(-water));
-  return toned(restored * exp(-beta * z) + veil, shownCompression * (1.0 - water));
+  return toned(restored * seen + veil, shownCompression * (1.0 - water));
 }
 
 void main() {
