@@ -152,6 +152,9 @@ class Slam:
     def _take(self, step: Step) -> list[Tracked]:
         """The frames of a step, and the edges that it found, each to who needs it."""
         finished = []
+        for depths in step.new_depths:
+            with self.failures.contain("second solution"):
+                self.frames.move(depths.keyframe, depths.carried)
         for anchored in self._anchor(step.frames):
             linked = self._link(anchored, step.links)
             self._look_for_known_lengths(linked.tracked)
