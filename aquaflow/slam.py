@@ -31,6 +31,7 @@ from aquaflow.tracking.frame_table import FrameTable, RelativeFrame, RelativePos
 from aquaflow.tracking.frames import (
     FrameClass,
     KeyframeEdge,
+    NewDepths,
     Revisit,
     Step,
     Tracked,
@@ -152,6 +153,9 @@ class Slam:
     def _take(self, step: Step) -> list[Tracked]:
         """The frames of a step, and the edges that it found, each to who needs it."""
         finished = []
+        for depths in step.new_depths:
+            with self.failures.contain("second solution"):
+                self._carry(depths)
         for anchored in self._anchor(step.frames):
             linked = self._link(anchored, step.links)
             self._look_for_known_lengths(linked.tracked)
@@ -161,6 +165,13 @@ class Slam:
         for revisit in step.revisits:
             self._revisit(revisit)
         return finished
+
+    def _carry(self, depths: NewDepths) -> None:
+        """Not in the paper: the frames of a keyframe whose depths were solved again follow them,
+        and so do their views."""
+        T_wk = self.keyframes[depths.keyframe].T_wc
+        self.frames.move(depths.keyframe, depths.carried)
+        self.maps.carry(depths.keyframe, lambda T_wc: T_wk @ depths.carried(T_wk.inverse() @ T_wc))
 
     def take_finished(self, wait: bool = False) -> None:
         """Apply what the worker has found since; with ``wait``, all that was asked for."""

@@ -142,6 +142,9 @@ class MapThread:
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         self._post("correct", MapCorrection(moves, merged))
 
+    def carry(self, keyframe: int, carried: Callable[[Sim3], Sim3]) -> None:
+        self._post("carry", lambda maps: maps.carry(keyframe, carried))
+
     def inspect(self, name: str, job: Callable[[OwnedMaps, list[MapCorrection]], None]) -> None:
         """Run ``job`` on the maps before all waiting requests; its second argument is the
         corrections that tracking has made and the maps do not contain yet."""

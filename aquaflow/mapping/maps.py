@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +116,13 @@ class Maps:
             views = self.held_out.setdefault(target, [])
             views.extend(self.held_out.pop(source, []))
             drop_surplus(views, views, self.config.mapping.held_out_most)
+
+    def carry(self, keyframe: int, carried: Callable[[Sim3], Sim3]) -> None:
+        mapped = [mapper.views for mapper in self.mappers.values()]
+        for views in [*mapped, *self.held_out.values()]:
+            for view in views:
+                if view.keyframe == keyframe:
+                    view.T_wc = carried(view.T_wc).if_finite()
 
     def _merge(self, source: int, target: int) -> None:
         """Merge two maps; a failure before the Gaussians were moved leaves both unchanged."""

@@ -87,6 +87,11 @@ class MapWork(Protocol):
         """Move Gaussians and views with their keyframes; merge the maps of merged sub-maps."""
         ...
 
+    def carry(self, keyframe: int, carried: Callable[[Sim3], Sim3]) -> None:
+        """Give the views of a keyframe whose depths were solved again the poses that go with them,
+        from T_wc to T_wc; the optimiser moves the Gaussians."""
+        ...
+
     def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
         """After the last frame, as far as there is time; the caller owns the maps from here on."""
         ...
@@ -178,6 +183,9 @@ class NoMaps:
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         """Nothing moves with its keyframe."""
+
+    def carry(self, keyframe: int, carried: Callable[[Sim3], Sim3]) -> None:
+        """No view has a pose."""
 
     def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
         """There is nothing to refine."""

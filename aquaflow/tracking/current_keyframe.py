@@ -185,6 +185,15 @@ class KeyframeTracker:
             at.matches = predicted_matches(pointmap, known, T_fk, camera, solved.pair.matches)
         fuse(pointmap, solved.pair, T_fk, camera, self._config.sigma_px)
 
+    def solve_again(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Matched:
+        """The last frame's pose against depths that have changed since."""
+        T_fk = solved.estimate.T
+        again = self._matcher.pose(at.keyframe, camera, solved.pair, T_fk, T_fk)
+        if again is None:
+            return solved
+        at.T_fk = again.estimate.T
+        return again
+
     def is_hidden(self, solved: Matched) -> bool:
         """True if something in front of the scene hides the matches."""
         return solved.visibility.seen < MIN_SEEN

@@ -6,7 +6,7 @@ makes it the frame's pose in the world.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,6 +72,16 @@ class FrameTable:
         )  # fmt: skip
         self._count += 1
         self._camera = frame.camera
+
+    def move(self, keyframe: int, moved: Callable[[Sim3], Sim3]) -> None:
+        """Replace the poses of all frames in a keyframe."""
+        for i, chunk in enumerate(self._chunks):
+            rows = np.flatnonzero(chunk["keyframe"][: self._count - i * CHUNK] == keyframe)
+            if len(rows) > 0:
+                # Of a copy, for parts that were handed out stay as they were.
+                self._chunks[i] = chunk.copy()
+                poses = [moved(to_sim3(pose)) for pose in chunk["T_kf"][rows]]
+                self._chunks[i]["T_kf"][rows] = of_sim3(poses)
 
     def rows(self) -> Array:
         """[N] FRAME, a copy."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -96,6 +96,23 @@ class Tracked:
         return replace(self, frame=without_pictures(self.frame), pointmap=None)
 
 
+class NewDepths(Protocol):
+    """Depths of a keyframe that have changed together, and what that makes of poses against it."""
+
+    @property
+    def keyframe(self) -> int:
+        """Number of the keyframe."""
+        ...
+
+    def concerns(self, tracked: Tracked) -> bool:
+        """True of a frame whose pose was solved against the old depths."""
+        ...
+
+    def carried(self, T_kf: Sim3) -> Sim3:
+        """The pose of such a frame in the keyframe, against the new ones."""
+        ...
+
+
 @dataclass(frozen=True)
 class Step:
     """What tracking found out with a frame: plain data for the graph, the maps and the table."""
@@ -105,6 +122,8 @@ class Step:
     links: dict[int, KeyframeEdge] = field(default_factory=dict)
     """Of the new keyframes that continue a sub-map, by their numbers."""
     revisits: list[Revisit] = field(default_factory=list)
+    new_depths: list[NewDepths] = field(default_factory=list)
+    """Frames finished before are to be carried over to them; those of this step are."""
 
 
 def without_pictures(frame: Frame) -> Frame:

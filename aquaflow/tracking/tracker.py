@@ -29,6 +29,7 @@ from aquaflow.tracking.frames import (
     WaitingFrames,
 )
 from aquaflow.tracking.initialisation.back_fill import BackFillResult, BackFills
+from aquaflow.tracking.initialisation.second_solution import SecondSolution
 from aquaflow.tracking.keyframe_reuse import STAGE as RETURN
 from aquaflow.tracking.keyframe_reuse import KeyframeReuse, ReuseResult, carry
 from aquaflow.tracking.loops import Places
@@ -85,6 +86,8 @@ class Tracker:
         self._back_fills = BackFills(waiting, prior, self._keyframe_tracker, self._failures, worker)
         self._at: CurrentKeyframe | None = None
         self._origin = Sim3.identity()
+        self._second: SecondSolution | None = None
+        """Of the newest start, until its first keyframe is left."""
         self.monitor = ConsistencyMonitor(self._keyframe_tracker.neighbours, config)
         self._repair = Repairs(self.monitor, self._keyframe_tracker)
         self._returning = KeyframeReuse(self._keyframe_tracker, config, worker, self._failures)
@@ -181,7 +184,17 @@ class Tracker:
         if run.failed and frame is not None:
             self._waiting.put([frame], Wait.IN_HAND)
         edges, self._edges = self._edges, Step()
-        return replace(edges, frames=self._hold_lost(self._waiting.settle(decided, self._as_lost)))
+        leaving = self._hold_lost(self._waiting.settle(decided, self._as_lost))
+        return replace(edges, frames=[self._carried(each, edges) for each in leaving])
+
+    def _carried(self, tracked: Tracked, edges: Step) -> Tracked:
+        """The frame as the depths that this step has changed put it."""
+        for depths in edges.new_depths:
+            if tracked.T_wc is not None and depths.concerns(tracked):
+                T_wk = self._keyframes[depths.keyframe].T_wc
+                T_kf = depths.carried(T_wk.inverse() @ tracked.T_wc)
+                return replace(tracked, T_wc=(T_wk @ T_kf).if_finite())
+        return tracked
 
     def _hold_lost(self, leaving: list[Tracked]) -> list[Tracked]:
         """Those that leave; in a replay, frames that are lost wait for its end."""
@@ -251,6 +264,7 @@ class Tracker:
         first, encoding, pointmap = started.reference, started.encoding, started.pointmap
         new = self._keyframe_tracker.at_new_keyframe
         at = self._at = new(first, encoding, self._origin, pointmap, self.sub_map)
+        self._second = SecondSolution(at.keyframe, self._config)
         tracked = [at.tracked_result(first, FrameClass.KEYFRAME, Quality(), pointmap.copy())]
         at.T_fk = started.T_waiting
         tracked += self._back_fill()
@@ -348,6 +362,23 @@ class Tracker:
         pointmap, _ = self._keyframe_tracker.pointmap(at, solved, camera)
         return find_revisit(at, solved, back, solved_back, pointmap)
 
+    def _solve_again(
+        self,
+        second: SecondSolution,
+        frame: Frame,
+        at: CurrentKeyframe,
+        solved: Matched,
+        camera: CameraModel,
+    ) -> Matched:
+        """The map's first keyframe is left: its second solution, and the frame's pose with it."""
+        self._second = None
+        with self._failures.contain("second solution", frame.index):
+            depths = second.solve(frame.index)
+            if depths is not None:
+                self._edges.new_depths.append(depths)
+                return self._keyframe_tracker.solve_again(at, solved, camera)
+        return solved
+
     # --- loss -----------------------------------------------------------------------------------
 
     def _start_sub_map(self) -> list[Tracked]:
@@ -418,6 +449,9 @@ class Tracker:
         if solved is None:
             return None
         keyframe_tracker.take(at, solved, camera)
+        second = self._second if self._second and self._second.keyframe is at.keyframe else None
+        if second is not None and not keyframe_tracker.is_hidden(solved):
+            second.take(solved)
         at.t_ns = frame.t_ns
         if keyframe_tracker.is_hidden(solved):
             frame = keyframe_tracker.without_hidden(frame, at, solved, camera)
@@ -428,6 +462,8 @@ class Tracker:
             frame_class = FrameClass.KEYFRAME if due else FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
             return self._at.tracked_result(frame, frame_class, self._solved.quality)
+        if second is not None and frame_class is FrameClass.KEYFRAME:
+            solved = self._solve_again(second, frame, at, solved, camera)
         pointmap, depth = keyframe_tracker.pointmap(at, solved, camera)
         if depth is not None:
             frame, pointmap = keyframe_tracker.without_moving(frame, at, solved, pointmap, depth)

@@ -93,6 +93,21 @@ def test_held_out_views_follow_their_keyframes() -> None:
     assert held_out.T_wc.t[0] - before == pytest.approx(1.0)
 
 
+def test_views_of_a_keyframe_that_was_solved_again_get_their_new_poses() -> None:
+    maps = two_maps()
+    held_out = maps.mappers[0].views.pop()
+    maps.hold_out(held_out, sub_map=0)
+    views = [held_out, *maps.mappers[0].views, *maps.mappers[1].views]
+    held_out.keyframe, others = 77, views[2:]
+    views[1].keyframe = 77
+    before = [view.T_wc.t.copy() for view in views]
+    aside = Sim3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    maps.carry(77, lambda T_wc: aside @ T_wc)
+    for view, t in zip(views, before, strict=True):
+        expected = t if any(view is other for other in others) else t + aside.t
+        np.testing.assert_allclose(view.T_wc.t, expected)
+
+
 def test_a_merge_that_fails_after_the_gaussians_came_over_is_a_merge(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -96,3 +96,20 @@ def test_rows_of_frames_csv_come_back_from_their_lines() -> None:
     assert to_text(of_text(text)) == text
     assert of_text(text)[0] == rows[0]
     assert of_text(text + "5,cut sho") == of_text(text)
+
+
+def test_the_frames_of_a_keyframe_move_and_parts_handed_out_do_not() -> None:
+    count = CHUNK + 7
+    table, shift = table_of(count), Sim3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    keyframe = CHUNK // 5
+    parts = [part.copy() for part in table.parts()]
+    handed_out = table.parts()
+    table.move(keyframe, lambda T_kf: shift @ T_kf)
+    for before, after in zip(parts, handed_out, strict=True):
+        assert np.array_equal(before, after)
+    for (found, pose), index in zip(table, range(count), strict=True):
+        _, T_kf = tracked(index)
+        if T_kf is not None:
+            wanted = shift @ T_kf if found.keyframe == keyframe else T_kf
+            assert pose is not None
+            assert np.array_equal(pose.matrix, wanted.matrix)

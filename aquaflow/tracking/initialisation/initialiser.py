@@ -90,7 +90,7 @@ class Initialiser:
         self.contradicted = False
         """True if no geometry explained the matches of the last attempt, which had little parallax:
         they have gone wrong."""
-        self._samples = _grid_samples(reference.interesting, config.points)
+        self._samples = grid_samples(reference.interesting, config.points)
 
     def add(self, frame: Frame, encoding: Encoding) -> bool:
         """Match a frame to the reference; False when it no longer sees the same place."""
@@ -103,14 +103,8 @@ class Initialiser:
         parallax = rotation_compensated_parallax_px(
             self._pixels_reference[observed], pixels[observed], self.reference.camera
         )
-        stated = pair.C[rows, columns]
-        # One that is no number would make the whole cost none.
-        confidence = np.where(observed & (stated > 0.0), stated, 0.0).astype(np.float64)
-        sure = int((confidence > SURE).sum())
-        self._sure.append(sure)
-        if sure >= MIN_MATCHES:
-            confidence[confidence < UNSURE] = 0.0
-        weights = confidence / (confidence + HALF_CONFIDENCE)
+        weights = match_weights(pair, rows, columns, UNSURE)
+        self._sure.append(int((weights > SURE / (SURE + HALF_CONFIDENCE)).sum()))
         # What is not a number compares with nothing: one such frame would hold up every start.
         parallax = parallax if np.isfinite(parallax) else 0.0
         farther = parallax > self.parallax_px
@@ -227,7 +221,24 @@ def calibrate(camera: CameraModel) -> CameraModel:
     return replace(camera, calibrated=True)
 
 
-def _grid_samples(
+def match_weights(
+    pair: PairGeometry,
+    rows: npt.NDArray[np.intp],  # [P]
+    columns: npt.NDArray[np.intp],  # [P]
+    least: float,
+) -> Array:
+    """[P] information of the matches at some pixels, over that of the surest; 0 where there is
+    none, and, where enough are sure, of those with less confidence than ``least``."""
+    stated = pair.C[rows, columns]
+    # One that is no number would make the whole cost none.
+    counts = pair.valid[rows, columns] & (stated > 0.0)
+    confidence = np.where(counts, stated, 0.0).astype(np.float64)
+    if (confidence > SURE).sum() >= MIN_MATCHES:
+        confidence[confidence < least] = 0.0
+    return confidence / (confidence + HALF_CONFIDENCE)
+
+
+def grid_samples(
     interesting: npt.NDArray[np.bool_],  # [H, W]
     count: int,
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
