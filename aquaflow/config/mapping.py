@@ -92,7 +92,7 @@ class SunlightConfig(StageConfig):
 
     enabled: bool = Field(
         True,
-        description="False: all views are held to be lit alike; 4.3 dB worse on the reef clip, "
+        description="False: all views are held to be lit alike; 4.4 dB worse on the reef clip, "
         "0.4 on Curasao, no different where no sun plays",
     )
 
