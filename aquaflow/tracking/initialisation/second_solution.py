@@ -109,11 +109,13 @@ class SecondSolution:
         rays = pointmap.camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1))
         rho = pointmap.rho[rows, columns]
         anew = rho + changes_of_depths(rays, rho, found.T[-1], pointmap.camera) @ found.bend()
-        sound = anew > MIN_RHO
+        change = change_of_poses([view.T_fk for view in self._views], found.T)
+        sound = (anew > MIN_RHO) & np.isfinite(anew)
+        if not (sound.any() and np.isfinite(change).all()):
+            return None
         rows, columns, rho, anew = rows[sound], columns[sound], rho[sound], anew[sound]
         pointmap.rho[rows, columns] = anew
         pointmap.variance[rows, columns] *= (anew / rho) ** 2
-        change = change_of_poses([view.T_fk for view in self._views], found.T)
         return Reshaped(self.keyframe.number, index, change)
 
     def _solution(self) -> Solved | None:
