@@ -33,9 +33,15 @@ def recording(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="module")
-def dive(recording: Path, aquaflow: Cli, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dive(
+    recording: Path,
+    small_recording: Path,
+    aquaflow: Cli,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
     out = tmp_path_factory.mktemp("mapped") / "dive"
-    ran = aquaflow("map", recording, "--tracking-only", *HASTY, "--out", out)
+    calibration = ("--calib", small_recording / "camera.yaml")
+    ran = aquaflow("map", recording, *calibration, "--tracking-only", *HASTY, "--out", out)
     assert ran.code in (0, 3), ran.err
     assert not set(COMMANDS) & set(ran.out + ran.err)
     return out
