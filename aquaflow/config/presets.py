@@ -14,7 +14,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "tracking": {"matches": 2500},
         "mapping": {
             "max_gaussians": 80_000,
-            "insertion": {"density": 0.25},
+            "insertion": {"density": 1.0},
             "optimiser": {
                 "steps_keyframe": 8, "steps_mapping": 8, "steps_common": 2, "refine_steps": 400,
             },
@@ -44,6 +44,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "max_gaussians": 1_200_000,
             "insertion": {
                 "selection": "threshold", "tau_a": 0.1, "colour_range": "rendered",
+                "density": 1.0,
             },
             "loss": {"ssim": 0.2, "depth": 0.01, "scale": 0.01},
             "optimiser": {"steps_keyframe": 20, "steps_mapping": 20, "steps_common": 10},
