@@ -96,7 +96,8 @@ def _judged(
 ) -> tuple[list[str], str]:
     kind, moment = task.strike.kind, met or Moment()
     problems = verdict.exit_problems(kind, moment, ended)
-    ended_whole = ended.code in verdict.ENDED and not verdict.stopped_empty(kind, moment, ended)
+    empty = verdict.stopped_empty(kind, moment, ended, folder / "dive")
+    ended_whole = ended.code in verdict.ENDED and not empty
     at_start = met is not None and met.phase == "start"
     if not problems and ended_whole:
         problems = _looked_at(folder, before)

@@ -71,9 +71,21 @@ def exit_problems(kind: Kind, met: Moment, ended: Ended) -> list[str]:
     return [f"exit {ended.code}: {_last_line(ended.err)}"]
 
 
-def stopped_empty(kind: Kind, met: Moment, ended: Ended) -> bool:
-    """True for a live dive that was interrupted before its first frame: it has nothing to write."""
-    return kind is Kind.INTERRUPT and met.phase == "start" and ended.code == POOR
+def stopped_empty(kind: Kind, met: Moment, ended: Ended, dive: Path) -> bool:
+    """True for a live dive that was interrupted before its first map: it has nothing to write."""
+    from aquaflow.base.errors import AquaFlowError
+    from aquaflow.dive.frames_csv import read_rows
+    from aquaflow.mapping.work import MIN_VIEWS
+
+    if kind is not Kind.INTERRUPT or ended.code != POOR:
+        return False
+    if met.phase == "start":
+        return True
+    try:
+        rows = read_rows(dive / "frames.csv")
+    except AquaFlowError:
+        return False  # what is wrong with it is found when the folder is looked at
+    return sum(row.sub_map is not None for row in rows) < MIN_VIEWS
 
 
 def folder_problems(dive: Path, before: Before) -> list[str]:
