@@ -34,6 +34,7 @@ from aquaflow.mapping.optimisation import (
     refining_rates,
     register,
     sampled_views,
+    share_done,
     shuffled_views,
     take_light,
 )
@@ -244,7 +245,7 @@ class Mapper:
                 if step % len(self.views) == 0:  # light shows once the map has lost its errors
                     self.scene.sunlight.judge(in_time(self.views))
                     self.scene.centre_water(self.views)
-                done = max(step / max(steps - 1, 1), passed)
+                done = share_done(step, steps, passed)
                 self.optimiser.slow_down(refining_rates(done, self.config.optimiser))
                 self._contained_step("refinement", view, self.config.optimiser.poses > 0.0)
                 if self._failed_in_a_row == MOST_FAILED_STEPS:

@@ -88,11 +88,20 @@ def test_rates_other_than_the_means_fall_in_the_last_share_of_refining_only() ->
 
 def test_rates_fall_in_the_time_that_refining_has() -> None:
     mapper, ticks = grown(settings(optimiser={"refine_steps": 50})), itertools.count()
-    mapper.refine(until=Deadline(11.5, lambda: float(next(ticks))))
+    mapper.refine(until=Deadline(40.5, lambda: float(next(ticks))))
     rates = DRY.optimiser
     assert mapper.optimiser.adam.learning_rates["log_scales"] == pytest.approx(
         rates.log_scales * rates.settle_final, rel=0.4
     )
+
+
+def test_the_clock_decides_nothing_while_the_steps_are_in_time() -> None:
+    tables = []
+    for tick_s in (0.01, 0.3):
+        mapper, ticks = grown(settings(optimiser={"refine_steps": 8})), itertools.count()
+        mapper.refine(until=Deadline(10.0, lambda s=tick_s, t=ticks: s * next(t)))
+        tables.append(copied(mapper))
+    assert same(*tables)
 
 
 def test_refinement_ends_when_its_time_is_up() -> None:
