@@ -148,7 +148,7 @@ def exposure_steps(check: Check, seed: int) -> None:
 @case("images", "tracking.current_keyframe.KeyframeTracker.classify")
 def snow(check: Check, seed: int) -> None:
     """Two seconds of marine snow over two fifths of the picture: it makes no keyframe."""
-    camera, poses, snowy = CAMERA.scaled(320, 240), path(34, step_m=0.015), range(8, 28)
+    camera, poses, snowy = CAMERA.resize(320, 240), path(34, step_m=0.015), range(8, 28)
     clear = film(Floor(seed), poses, camera)
     frames = spoil(clear, snowy, marine_snow(camera, 0.4, seed))
     result = track(frames)
@@ -180,7 +180,7 @@ def one_by_one(check: Check, seed: int) -> None:
 @case("images", "sources.preprocessing.Preparation")
 def width_8192(check: Check, seed: int) -> None:
     """Pictures 8192 pixels wide are made small, then tracked."""
-    large = CAMERA.scaled(8192, 6144)
+    large = CAMERA.resize(8192, 6144)
     floor, prepare = Floor(seed), Preparation(SourceConfig(width=CAMERA.width), large)
     frames = []
     for frame in film(floor, path(6)):

@@ -77,7 +77,7 @@ def _frame(image: Path, depth: Path, camera: CameraModel) -> Posed:
     if metres is None or metres.shape != picture.shape[:2]:
         raise InputError(f"{depth} does not fit its picture; unpack the data set again")
     height, width = picture.shape[:2]
-    sized = camera.scaled(width, height)
+    sized = camera.resize(width, height)
     depth_m = np.nan_to_num(np.asarray(metres, dtype=np.float32), posinf=0.0, neginf=0.0)
     if sized.is_distorted:
         maps = _undistorting(sized)
