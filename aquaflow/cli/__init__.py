@@ -31,8 +31,7 @@ from aquaflow.cli.doctor import config, doctor_group, inspect
 from aquaflow.cli.export import export_group
 from aquaflow.cli.lab import lab_group
 from aquaflow.cli.measure import measure_group
-from aquaflow.cli.record import record
-from aquaflow.cli.service import exit_code, map_realtime, print_finished, run_group, view
+from aquaflow.cli.service import exit_code, map_realtime, print_finished, record, run_group, view
 from aquaflow.cli.site import app as site_group
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 
+from aquaflow.base.clocks.wall import OLDEST_NS
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Stages
@@ -39,7 +40,6 @@ from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam, make_maps
-from aquaflow.sources.wall_clock import OLDEST_NS
 from aquaflow.types import Dropped
 
 # --------------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from functools import partial
 from typing import Protocol, runtime_checkable
 
 from aquaflow.base.clocks.device import Learned
+from aquaflow.base.clocks.wall import WallClock
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config, SourceConfig
 from aquaflow.config.service import ServiceConfig
@@ -33,12 +34,10 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.clock_reading import Continued
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples
-from aquaflow.recordings.playback import Event, Playback, delay_event
+from aquaflow.recordings.playback import Event, Playback, delay_event, read_past_failures
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, HearsPilot, OutboundMessage
-from aquaflow.sources.reading import read_past_failures
-from aquaflow.sources.wall_clock import WallClock
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)

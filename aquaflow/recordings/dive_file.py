@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from aquaflow.base.errors import InputError
-from aquaflow.recordings.telemetry_json import sample_schema
+from aquaflow.recordings.telemetry_lines import sample_schema
 
 LIBRARY = "aquaflow"
 """Who wrote the file, in its header."""
