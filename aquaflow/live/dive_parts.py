@@ -147,18 +147,7 @@ def assemble(
         stated = camera_mounting(config, service, feed)
         slam.metric.mounting = stated or _mounting_of(before)
     run = DiveRun(name, folder, config, slam, feed.calibration, feed.name_of)
-    continued = Continued()
-    if choice.checkpoint is not None:
-        continued = _restore(choice.checkpoint, slam, run, maps)
-    run.notes += [*choice.notes, *losses, *said]
-    for note in run.notes:
-        log.warning("%s", note)
-    feed.continue_from(continued)
-    failures.attempt(
-        "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
-    )
-    telemetry_log = partial(TelemetryWriter, folder.path / TELEMETRY)
-    run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
+    _begin(run, choice, feed, maps, [*choice.notes, *losses, *said])
     vitals.health.begin()
     pressure = PressureReader(folder.path, gpu_free=thread.usable_memory)
     loop = LiveLoop(run, feed, thread, service, vitals, control, pressure)
@@ -188,6 +177,27 @@ def assemble(
     return Parts(
         loop, slam, run, thread, checkpointer, refresher, choice, standing, errors, frames_before
     )  # fmt: skip
+
+
+def _begin(run: DiveRun, choice: Choice, feed: Feed, maps: OwnedMaps, notes: list[str]) -> None:
+    """Bring the run to where its checkpoint has it, with ``notes`` on that, and open its files.
+
+    Raises:
+        UnusableStateError: the dive cannot be resumed from the checkpoint.
+    """
+    continued = Continued()
+    if choice.checkpoint is not None:
+        continued = _restore(choice.checkpoint, run.slam, run, maps)
+    run.notes += notes
+    for note in run.notes:
+        log.warning("%s", note)
+    feed.continue_from(continued)
+    folder, failures = run.folder, feed.failures
+    failures.attempt(
+        "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
+    )
+    telemetry_log = partial(TelemetryWriter, folder.path / TELEMETRY)
+    run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
 
 
 def _mounting_of(before: DiveStatus | None) -> MountingConfig | None:

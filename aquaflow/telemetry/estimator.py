@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -85,19 +86,11 @@ def estimate(
         found.prior[CLOCK] = clocks.sigma_of(found)
         return found
 
-    while True:
-        problem = problem_along(path, points)
-        if not problem.factors:
-            unused = WorldFrame.unknown("no telemetry could be used")
-            unused = replace(unused, sources=tuple(problem.reports))
-            return Estimate(clocks.with_clocks(unused))
-        solution = solve(problem.factors, problem.start, problem.prior)
-        wrong = contradiction_in(problem, solution)
-        if wrong is None:
-            break
-        rejected[wrong.source, wrong.kind] = SourceReport(
-            wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
-        )
+    problem, solution = _solve_consistent(partial(problem_along, path, points), rejected)
+    if solution is None:
+        unused = WorldFrame.unknown("no telemetry could be used")
+        unused = replace(unused, sources=tuple(problem.reports))
+        return Estimate(clocks.with_clocks(unused))
     unconfirmed = ""
     if clocks.leave_open(problem):
         ground = points()
@@ -112,6 +105,24 @@ def estimate(
         said = f"{frame.scale_source}; {unconfirmed}"
         frame = replace(frame, scale_confirmed=False, scale_source=said)
     return Estimate(clocks.with_clocks(frame), problem, solution)
+
+
+def _solve_consistent(
+    make: Callable[[], TelemetryProblem], rejected: dict[tuple[str, str], SourceReport]
+) -> tuple[TelemetryProblem, Solution | None]:
+    """The problem without sources that contradict the others, which are added to ``rejected``; no
+    solution where no source is left."""
+    while True:
+        problem = make()
+        if not problem.factors:
+            return problem, None
+        solution = solve(problem.factors, problem.start, problem.prior)
+        wrong = contradiction_in(problem, solution)
+        if wrong is None:
+            return problem, solution
+        rejected[wrong.source, wrong.kind] = SourceReport(
+            wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
+        )
 
 
 # --------------------------------------------------------------------------------------------------
