@@ -15,6 +15,7 @@ import numpy as np
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.medium import NAME as MEDIUM
+from aquaflow.geometry.arrays import sim3_to_json
 from aquaflow.lab.evaluation import metric_error as water
 from aquaflow.lab.evaluation.dive_files import EvaluatedDive, evaluated_dive
 from aquaflow.lab.evaluation.metric_error import MetricError, metric_error
@@ -72,9 +73,7 @@ class Evaluation:
             "path_length": error.path_length,
             "alignment": {
                 "kind": "sim3",
-                "scale": sim3.scale,
-                "rotation": sim3.R.tolist(),
-                "translation": sim3.t.tolist(),
+                **sim3_to_json(sim3),
                 "collinear": error.sim3.alignment.collinear,
             },
             "metric": self.metric.to_json() if self.metric else None,
