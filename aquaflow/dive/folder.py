@@ -331,15 +331,6 @@ class DiveFolder:
             for name, picture in pictures.items():
                 write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
 
-    def write_bytes(self, name: str, content: bytes) -> None:
-        """A file whose content is made already.
-
-        Raises:
-            InputError: it cannot be written.
-        """
-        with atomic_write(self.path / name) as stream:
-            stream.write(content)
-
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """A JSON file of the dive; a number that is not finite is unknown, null."""
         write_json(self.path / name, _finite(data))
