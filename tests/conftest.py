@@ -163,3 +163,9 @@ def no_watchdog_is_left() -> Iterator[None]:
 
 def _watchdogs() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "watchdog"}
+
+
+@pytest.fixture(scope="session")
+def onnxscript() -> None:
+    """Its import takes seconds: only where a test runs, not where tests are collected."""
+    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")

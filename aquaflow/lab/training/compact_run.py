@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from aquaflow.base.errors import InputError
+from aquaflow.lab.networks.compact.export import export
+from aquaflow.lab.networks.compact.network import CompactPrior
 from aquaflow.lab.training.compact import CompactSettings, CompactTask
 from aquaflow.lab.training.compact_range import (
     calibration_figures,
@@ -40,8 +42,6 @@ from aquaflow.lab.training.trainer import (
     has_ended,
     train,
 )
-from aquaflow.prior.compact.export import export
-from aquaflow.prior.compact.network import CompactPrior
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, write_card
 from aquaflow.prior.runtime import INT8_ENCODER
 

@@ -15,6 +15,8 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from aquaflow import cli
+from aquaflow.lab.networks.compact import network as compact_network
+from aquaflow.lab.networks.compact.network import CompactPrior, Encoded, NetworkSize
 from aquaflow.lab.training import compact, compact_run, held_out
 from aquaflow.lab.training import compact_run as compact_figures
 from aquaflow.lab.training.compact import CompactSettings
@@ -32,8 +34,6 @@ from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.stored_pairs import Pool
 from aquaflow.lab.training.pairs import overlap
-from aquaflow.prior.compact import network as compact_network
-from aquaflow.prior.compact.network import CompactPrior, Encoded, NetworkSize
 from aquaflow.prior.folder import read_card
 from tests.lab.training.small_maps import small_dive
 

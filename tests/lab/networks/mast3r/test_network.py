@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.prior.mast3r.network import (
+from aquaflow.lab.networks.mast3r.network import (
     FULL,
     PATCH_PX,
     TINY,
