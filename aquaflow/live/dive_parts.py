@@ -10,7 +10,6 @@ from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 
-from aquaflow.base.clocks.wall import OLDEST_NS
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Stages
@@ -26,7 +25,7 @@ from aquaflow.live.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.live.checkpoint.generations import Checkpoint
 from aquaflow.live.checkpoint.repair import hear_again, lost_with_their_files
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.clock_reading import ClockReading, Continued
+from aquaflow.live.clock_reading import OLDEST_NS, ClockReading, Continued
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.deliverable_updates import DeliverableUpdater
 from aquaflow.live.feed import Feed, camera_mounting

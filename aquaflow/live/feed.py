@@ -25,13 +25,12 @@ from functools import partial
 from typing import Protocol, runtime_checkable
 
 from aquaflow.base.clocks.device import Learned
-from aquaflow.base.clocks.wall import WallClock
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config, SourceConfig
 from aquaflow.config.service import ServiceConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.live.clock_reading import Continued
+from aquaflow.live.clock_reading import Continued, WallClock
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples
 from aquaflow.recordings.playback import Event, Playback, delay_event, read_past_failures

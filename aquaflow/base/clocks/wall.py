@@ -7,13 +7,10 @@ from __future__ import annotations
 import ctypes
 import logging
 import math
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-
-from aquaflow.types import UtcTime
 
 log = logging.getLogger(__name__)
 
@@ -159,37 +156,3 @@ class Deadline:
     def share(self, part: float) -> Deadline:
         """One after ``part`` of the time that is left."""
         return self.within(part * self.left_s if self.limited else None)
-
-
-# --------------------------------------------------------------------------------------------------
-# The wall clock as a source of UTC, so that a recording holds what a live dive heard.
-
-SOURCE = "computer/clock"
-"""Name of the samples' source."""
-EVERY_S = 10.0
-"""A computer's clock drifts by 1e-4 at most: 1 ms."""
-OLDEST_NS = 1_735_689_600 * 1_000_000_000
-"""2025-01-01: a clock from before this program existed was never set."""
-
-
-class WallClock:
-    """Yields the wall clock every ``every_s`` until it is closed, as the computer has it: after it
-    was set, as it is then."""
-
-    def __init__(self, every_s: float = EVERY_S) -> None:
-        self._every_s = every_s
-        self._closed = threading.Event()
-        self._watch = WallClockWatch()
-
-    def samples(self) -> Iterator[UtcTime]:
-        """The first at once; none while the computer's clock was never set."""
-        while not self._closed.is_set():
-            now = self._watch.read()
-            t_ns, utc_ns = now.monotonic_ns, now.monotonic_ns + now.offset_ns
-            if utc_ns >= OLDEST_NS:
-                yield UtcTime(t_ns, t_ns, SOURCE, utc_ns)
-            self._closed.wait(self._every_s)
-
-    def close(self) -> None:
-        """End the samples."""
-        self._closed.set()

@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Protocol, TypeAlias, runtime_checkable
 
-from aquaflow.base.clocks.wall import WallClock
 from aquaflow.base.errors import AquaFlowError
+from aquaflow.live.clock_reading import WallClock
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.recordings.playback import Event, Playback, arrival_of, delay_event
 from aquaflow.sources import CameraSource, RawTap, TelemetrySource
