@@ -100,8 +100,10 @@ def export_mesh(
     require_marching_cubes()
     if kind != "ply":
         load("xatlas", "a textured mesh", "survey")
-    mapper, frame = dive.filled_map(), dive.frame
+    mapper, frame = dive.map(), dive.frame
     posed, where = read_posed_views(dive, mapper)
+    if len(mapper.gaussians) == 0:
+        raise InputError(f"the map of {dive} is empty; map a recording that shows more")
     scale, report = frame.T_nm.scale, progress or _nothing
     drawn = drawn_surfaces(mapper, scale)
     views = ViewSurfaces(posed, drawn, path.parent, partial(report, "views"))
