@@ -166,8 +166,8 @@ class Slam:
         """Not in the paper: the frames of a keyframe whose depths were solved again follow them,
         and so do their views."""
         T_wk = self.keyframes[depths.keyframe].T_wc
-        self.frames.move(depths.keyframe, depths.carried)
-        self.maps.carry(depths.keyframe, lambda T_wc: T_wk @ depths.carried(T_wk.inverse() @ T_wc))
+        self.frames.move(depths.keyframe, depths.correct)
+        self.maps.carry(depths.keyframe, lambda T_wc: T_wk @ depths.correct(T_wk.inverse() @ T_wc))
 
     def take_finished(self, wait: bool = False) -> None:
         """Apply what the worker has found since; with ``wait``, all that was asked for."""
