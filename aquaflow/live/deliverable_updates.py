@@ -20,7 +20,6 @@ from aquaflow import __version__
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.from_maps import water_in_numbers
 from aquaflow.dive.metric_outputs import MetricOutputs, frame_numbers, water_in, worlds_in_words
 from aquaflow.dive.results import WaterSummary, medium_json
 from aquaflow.dive.run import DiveRun
@@ -177,7 +176,9 @@ class Interim:
         main = self._main
         for number, mapper in mappers.items():
             if len(mapper.gaussians):
-                self._waters[number] = water_in_numbers(mapper, WATER_VIEWS)
+                from aquaflow.dive.map_file import summarise_water  # loads torch
+
+                self._waters[number] = summarise_water(mapper, WATER_VIEWS)
                 suffix = "" if number == main else f"_{number}"
                 frame, water = self._outputs.frame(number), self._waters[number]
                 self._run.folder.write_splats(mapper, water, frame, suffix)
