@@ -16,6 +16,7 @@ from aquaflow.base.stages import Stages
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
 from aquaflow.base.worker import Worker, core_count
 from aquaflow.config import Config, parse_config
+from aquaflow.config.service import LimitsConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
@@ -159,16 +160,7 @@ def assemble(
         lambda: feed.continued.known_shift_ns,
     )  # fmt: skip
     refresher = DeliverableUpdater(run, thread, service.checkpoint.deliverables_s)
-
-    def write_what_is_due(live: LiveLoop) -> None:
-        disk_is_full = live.pressure.disk_is_full(service.limits)
-        checkpointer.take_if_due(disk_is_full)
-        refresher.write_if_due(disk_is_full)
-
-    def note_pause() -> None:
-        checkpointer.take_soon()
-        refresher.write_soon()
-
+    write_what_is_due, note_pause = _writers(checkpointer, refresher, service.limits)
     standing = DiveStatusFile(folder.path, failures, slam.metric.mounting, before, note_pause)
     errors = DeviceErrors(feed.describe)
     loop.watchers += [standing.update, write_what_is_due, lambda live: errors.update()]
@@ -176,6 +168,23 @@ def assemble(
     return Parts(
         loop, slam, run, thread, checkpointer, refresher, choice, standing, errors, frames_before
     )  # fmt: skip
+
+
+def _writers(
+    checkpointer: Checkpointer, refresher: DeliverableUpdater, limits: LimitsConfig
+) -> tuple[Callable[[LiveLoop], None], Callable[[], None]]:
+    """What writes checkpoint and deliverables after a turn of the loop, and what a pause asks."""
+
+    def write_what_is_due(live: LiveLoop) -> None:
+        disk_is_full = live.pressure.disk_is_full(limits)
+        checkpointer.take_if_due(disk_is_full)
+        refresher.write_if_due(disk_is_full)
+
+    def note_pause() -> None:
+        checkpointer.take_soon()
+        refresher.write_soon()
+
+    return write_what_is_due, note_pause
 
 
 def _begin(run: DiveRun, choice: Choice, feed: Feed, maps: OwnedMaps, notes: list[str]) -> None:
