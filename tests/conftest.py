@@ -115,7 +115,8 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic dive of 24 small pictures, made once."""
 
     def make(folder: Path) -> None:
-        from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+        from aquaflow.lab.synthetic.config import SyntheticConfig
+        from aquaflow.lab.synthetic.dive import write_dive
 
         write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
 
