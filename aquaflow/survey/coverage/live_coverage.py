@@ -23,8 +23,10 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config.service import CoverageConfig
 from aquaflow.dive.views import CoverageView, RunningDive
 from aquaflow.mapping.work import OwnedMaps
-from aquaflow.survey.coverage import DiveCoverage, PageView, mapping_range
 from aquaflow.survey.coverage.coverage_files import CoverageFiles
+from aquaflow.survey.coverage.dive_coverage import DiveCoverage
+from aquaflow.survey.coverage.footprint import mapping_range
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.picture import cells_affine, cells_png, coverage_png
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
