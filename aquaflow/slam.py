@@ -23,6 +23,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.work import Growth, Insertion, MapWork, NoMaps, OwnedMaps
+from aquaflow.prior.contract import Prior
 from aquaflow.prior.factory import make_prior
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
@@ -81,12 +82,7 @@ class Slam:
         """
         self.config, self.stages = config, stages or Stages()
         self.profiler, self.failures = self.stages.profiler, self.stages.failures
-        self.prior = make_prior(config.prior)
-        if config.tracking.residual == "point" and not self.prior.ranged:
-            raise ConfigError(
-                "tracking.residual 'point' needs points of each frame's own, which the "
-                f"{self.prior.name} prior does not have; choose pixel or ray, or another prior"
-            )
+        self.prior = _prior_of(config)
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
         self._relative_poses = RelativePoses(self.keyframes, self.failures)
@@ -170,8 +166,8 @@ class Slam:
         """Not in the paper: the frames of a keyframe whose depths were solved again follow them,
         and so do their views."""
         T_wk = self.keyframes[depths.keyframe].T_wc
-        self.frames.move(depths.keyframe, depths.carried)
-        self.maps.carry(depths.keyframe, lambda T_wc: T_wk @ depths.carried(T_wk.inverse() @ T_wc))
+        self.frames.move(depths.keyframe, depths.correct)
+        self.maps.carry(depths.keyframe, lambda T_wc: T_wk @ depths.correct(T_wk.inverse() @ T_wc))
 
     def take_finished(self, wait: bool = False) -> None:
         """Apply what the worker has found since; with ``wait``, all that was asked for."""
@@ -477,6 +473,16 @@ class FinishTime:
 # The maps of a dive, and what tracked frames bring to them: views, some held out, and keyframes.
 #
 # With mapping off neither is loaded: both need torch, 100 MB that tracking alone has no use for.
+
+
+def _prior_of(config: Config) -> Prior:
+    prior = make_prior(config.prior)
+    if config.tracking.residual == "point" and not prior.ranged:
+        raise ConfigError(
+            "tracking.residual 'point' needs points of each frame's own, which the "
+            f"{prior.name} prior does not have; choose pixel or ray, or another prior"
+        )
+    return prior
 
 
 def make_maps(

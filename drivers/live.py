@@ -153,7 +153,7 @@ class LiveCamera:
             picture.t_ns,
             picture.arrival_ns,
             image,
-            camera if (camera.width, camera.height) == self._size else camera.scaled(width, height),
+            camera if (camera.width, camera.height) == self._size else camera.resize(width, height),
             picture.exposure_s,
             picture.gain,
             encoded=picture.received(),

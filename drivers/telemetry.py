@@ -23,6 +23,8 @@ from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)
 
+QUEUE_SAMPLES = 10_000
+"""Kept until fetched, then the oldest go: a minute at 160 samples/s."""
 CLOSE_TIMEOUT_S = 5.0
 """Longest wait for a thread at the end; one stuck in a system call is abandoned."""
 
@@ -82,7 +84,7 @@ class LinkTelemetry:
         tap: RawTap | None = None,
         links: Mapping[str, OpenLink] | None = None,
     ) -> None:
-        self._queue: Newest[_QueuedSample] = Newest(config.queue_samples, _count_dropped)
+        self._queue: Newest[_QueuedSample] = Newest(QUEUE_SAMPLES, _count_dropped)
         self._body = BodyFrame()
         self.decoders = {name: decoder_of(name, device) for name, device in config.devices.items()}
         self.links: dict[str, Supervisor] = {}

@@ -23,7 +23,7 @@ def main(dive_folder: str, truth_file: str, plot: str) -> None:
     of_ours, of_truth = aquaflow.associate(ours.t_s, truth.t_s)
     # One camera knows no metres, so the path is scaled to the truth (Sim(3) alignment).
     found = aquaflow.align(ours.positions[of_ours], truth.positions[of_truth], with_scale=True)
-    aligned = ours.select(of_ours).transformed(found.T_target_source).positions
+    aligned = ours.select(of_ours).transform(found.T_target_source).positions
     error_m = np.linalg.norm(aligned - truth.positions[of_truth], axis=1)
     print(f"a length of 1 in {dive.unit} is {found.T_target_source.scale:.3f} m of the truth")
     print(f"absolute trajectory error: {np.sqrt((error_m**2).mean()):.4f} m RMS")

@@ -19,7 +19,7 @@ from typing import TypedDict
 IMPORTED = (
     *("torch", "cv2", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "matplotlib.pyplot"),
     *("aquaflow.cli", "aquaflow.dive.replay", "aquaflow.lab.evaluation.summary"),
-    *("aquaflow.survey.report", "aquaflow.live.onboard", "aquaflow.lab.synthetic"),
+    *("aquaflow.survey.report.page", "aquaflow.live.onboard", "aquaflow.lab.synthetic.dive"),
 )
 """Slow to import; none of them starts a thread when it is imported, so a fork is whole."""
 

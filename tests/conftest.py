@@ -115,7 +115,8 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic dive of 24 small pictures, made once."""
 
     def make(folder: Path) -> None:
-        from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+        from aquaflow.lab.synthetic.config import SyntheticConfig
+        from aquaflow.lab.synthetic.dive import write_dive
 
         write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
 
@@ -163,3 +164,9 @@ def no_watchdog_is_left() -> Iterator[None]:
 
 def _watchdogs() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "watchdog"}
+
+
+@pytest.fixture(scope="session")
+def onnxscript() -> None:
+    """Its import takes seconds: only where a test runs, not where tests are collected."""
+    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")

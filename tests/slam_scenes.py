@@ -32,7 +32,7 @@ def frame_of(index: int) -> Frame:
 
 def pointmap(height: int = 48, width: int = 64) -> Pointmap:
     rho = np.full((height, width), 0.5)
-    return Pointmap(CAMERA.scaled(width, height), rho, (0.01 * rho) ** 2)
+    return Pointmap(CAMERA.resize(width, height), rho, (0.01 * rho) ** 2)
 
 
 class ToldTracker:

@@ -110,7 +110,7 @@ def _scale_to_images(known: CameraModel, views: Views) -> CameraModel:
             f"the known camera has pictures of {known.width} x {known.height}, these are "
             f"{views.width} x {views.height}; give pictures of the same shape"
         )
-    return known.scaled(views.width, views.height)
+    return known.resize(views.width, views.height)
 
 
 def _pictures(source: Path) -> Iterator[tuple[str, npt.NDArray[np.uint8]]]:

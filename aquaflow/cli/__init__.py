@@ -31,8 +31,7 @@ from aquaflow.cli.doctor import config, doctor_group, inspect
 from aquaflow.cli.export import export_group
 from aquaflow.cli.lab import lab_group
 from aquaflow.cli.measure import measure_group
-from aquaflow.cli.record import record
-from aquaflow.cli.service import exit_code, map_realtime, print_finished, run_group, view
+from aquaflow.cli.service import exit_code, map_realtime, print_finished, record, run_group, view
 from aquaflow.cli.site import app as site_group
 
 if TYPE_CHECKING:
@@ -195,17 +194,15 @@ def map_command(
             recording, source.name, out, settings, calibration, overwrite, progress, profile,
             given, base=None if in_site is None else base_of(in_site),
         )  # fmt: skip
-    if as_json:
-        typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))
-        raise typer.Exit(exit_code(replayed))
-    _print_summary(replayed)
-    shown = [name for name in ("report.html", "map.ply") if (replayed.dive / name).exists()]
-    typer.echo(f"Look at {' and '.join(str(replayed.dive / name) for name in shown)}.")
-    raise typer.Exit(exit_code(replayed))
+    _print_replayed(replayed, as_json)
 
 
-def _print_summary(finished: Finished) -> None:
+def _print_replayed(finished: Finished, as_json: bool) -> None:
+    """Numbers and notes of a dive; ends the command with its exit code."""
     metrics = finished.metrics
+    if as_json:
+        typer.echo(json.dumps({"dive": str(finished.dive), **metrics}))
+        raise typer.Exit(exit_code(finished))
     for warning in finished.warnings:
         typer.echo(f"Warning: {warning}.")
     quality = (
@@ -222,6 +219,9 @@ def _print_summary(finished: Finished) -> None:
         typer.echo(line)
     for note in finished.notes:
         typer.echo(f"Note: {note}.")
+    shown = [name for name in ("report.html", "map.ply") if (finished.dive / name).exists()]
+    typer.echo(f"Look at {' and '.join(str(finished.dive / name) for name in shown)}.")
+    raise typer.Exit(exit_code(finished))
 
 
 HELP: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, str]]] = {

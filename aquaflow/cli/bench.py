@@ -94,9 +94,6 @@ def bench(
 def render(
     quick: Annotated[bool, typer.Option("--quick", help="Only the bars' two sizes.")] = False,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 7,
-    opensplat: Annotated[
-        str | None, typer.Option(help="Times your OpenSplat build; see docs/performance.md.")
-    ] = None,
     device: Device = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
     as_json: Json = False,
@@ -109,7 +106,7 @@ def render(
     device = None if device is None else one_of(DEVICES, device, "--device")
     sizes = QUICK_SIZES if quick else SIZES
     with progress_bars(as_json) as progress:
-        result = bm.bench_render(sizes, repeats, out, opensplat, progress, device)
+        result = bm.bench_render(sizes, repeats, out, progress, device)
     if as_json:
         typer.echo(json.dumps(result))
         return

@@ -57,7 +57,8 @@ def synth(
     from pydantic import ValidationError
 
     from aquaflow.base.errors import ConfigError, words_of
-    from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+    from aquaflow.lab.synthetic.config import SyntheticConfig
+    from aquaflow.lab.synthetic.dive import write_dive
 
     asked = {
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,

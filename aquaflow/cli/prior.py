@@ -51,8 +51,8 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write encoder.onnx, decoder.onnx and prior.json for pictures of one size."""
-    from aquaflow.prior.mast3r.export import LICENCE_NOTICE, load_checkpoint
-    from aquaflow.prior.mast3r.export import export as export_mast3r
+    from aquaflow.lab.networks.mast3r.export import LICENCE_NOTICE, load_checkpoint
+    from aquaflow.lab.networks.mast3r.export import export as export_mast3r
 
     del network  # there is one so far
     typer.echo(LICENCE_NOTICE, err=True)
@@ -158,9 +158,9 @@ def train_mast3r(
 
     Several GPUs: torchrun --nproc-per-node 4 --no-python aquaflow lab prior train mast3r ...
     """
+    from aquaflow.lab.networks.mast3r.export import LICENCE_NOTICE, load_checkpoint
     from aquaflow.lab.training import finetune
     from aquaflow.lab.training.trainer import joined_processes
-    from aquaflow.prior.mast3r.export import LICENCE_NOTICE, load_checkpoint
 
     settings = finetune.FineTuningSettings(
         width, height, epochs, max(1, epochs * 2 // 15), batch, accumulate, seed
@@ -359,9 +359,9 @@ def verify(
 ) -> None:
     """Compare every output of the ONNX files with torch's, and with --device what tracking gets
     there with what it gets from the CPU in 32 bits; exit code 1 where they differ."""
+    from aquaflow.lab.networks.mast3r.export import verify_tiny
     from aquaflow.prior.describe import check, differences
     from aquaflow.prior.folder import read_card
-    from aquaflow.prior.mast3r.export import verify_tiny
     from aquaflow.prior.runtime import RuntimeSettings
 
     settings = None
@@ -392,9 +392,9 @@ def verify(
 
 
 def _parity_with(checkpoint: Path, folder: Path, card: PriorCard) -> dict[str, float]:
-    from aquaflow.prior.compact import export as compact
-    from aquaflow.prior.mast3r import export as mast3r
-    from aquaflow.prior.mast3r.export import load_checkpoint
+    from aquaflow.lab.networks.compact import export as compact
+    from aquaflow.lab.networks.mast3r import export as mast3r
+    from aquaflow.lab.networks.mast3r.export import load_checkpoint
 
     if card.name == "compact":
         return compact.parity_of(compact.load_checkpoint(checkpoint), folder)

@@ -180,9 +180,11 @@ class OptimiserConfig(StageConfig):
     opacity_logits: Lab[float] = Field(0.04, gt=0)
     raw_colours: Lab[float] = Field(6e-3, gt=0)
     poses: Lab[float] = Field(1e-4, ge=0, description="rad and map units; ARTDECO: 1e-4; 0: held")
-    steps_keyframe: int = Field(20, ge=0, description="steps after a keyframe (ARTDECO: 20)")
-    steps_mapping: int = Field(20, ge=0, description="steps after a mapping frame (ARTDECO: 20)")
-    steps_common: int = Field(2, ge=0, description="steps after a common frame (ARTDECO: 10)")
+    steps_keyframe: Lab[int] = Field(20, ge=0, description="steps after a keyframe (ARTDECO: 20)")
+    steps_mapping: Lab[int] = Field(
+        20, ge=0, description="steps after a mapping frame (ARTDECO: 20)"
+    )
+    steps_common: Lab[int] = Field(2, ge=0, description="steps after a common frame (ARTDECO: 10)")
     refine_steps: int = Field(
         800, ge=0, description="steps after the last frame (notes/2026-11-mapping.md#refining)"
     )
@@ -288,7 +290,7 @@ class MappingConfig(StageConfig):
         description="held-out views of a sub-map, spread over it, that are kept and judged: one "
         "takes heldout_steps, 256 some minutes; no reference clip has as many",
     )
-    views_per_keyframe: int = Field(
+    views_per_keyframe: Lab[int] = Field(
         48,
         ge=2,
         description="views kept for each keyframe, common ones and others each, "

@@ -121,6 +121,7 @@ CONSTANTS: dict[str, Any] = {
     "mapping.decoder.feature_rate": 4e-3,
     "mapping.sunlight.columns": 24,
     "service.limits.gpu_memory_share": 0.05,
+    "telemetry.queue_samples": 10_000,
     "viewer.picture_width": 240,
 }
 """Settings of before that are constants now, and their values."""

@@ -169,9 +169,6 @@ class TelemetryConfig(StageConfig):
     """Every telemetry device of a vehicle, by the name that its samples carry."""
 
     devices: dict[str, AnyDevice] = Field(default_factory=dict)
-    queue_samples: int = Field(
-        10_000, ge=1, description="kept until fetched, then the oldest go (a minute at 160/s)"
-    )
 
     @field_validator("devices")
     @classmethod

@@ -56,10 +56,18 @@ class GateConfig(StageConfig):
     See docs/architecture.md#skips.
     """
 
-    skip_duplicates: bool = Field(True, description="skip: nothing moved since the last frame used")
-    skip_dark: bool = Field(True, description="skip: too little light for texture above the noise")
-    skip_blurred: bool = Field(True, description="skip: detail gone, against the frames before")
-    skip_blinded: bool = Field(True, description="skip: lamp glare, silt, open water: no texture")
+    skip_duplicates: Lab[bool] = Field(
+        True, description="skip: nothing moved since the last frame used"
+    )
+    skip_dark: Lab[bool] = Field(
+        True, description="skip: too little light for texture above the noise"
+    )
+    skip_blurred: Lab[bool] = Field(
+        True, description="skip: detail gone, against the frames before"
+    )
+    skip_blinded: Lab[bool] = Field(
+        True, description="skip: lamp glare, silt, open water: no texture"
+    )
     longest_run: Lab[int] = Field(
         5,
         ge=0,
@@ -246,7 +254,7 @@ class VerificationConfig(StageConfig):
 class TrackingConfig(StageConfig):
     """Tracking and frame classes (paper, Sec. 3.2)."""
 
-    keyframe_share: float = Field(
+    keyframe_share: Lab[float] = Field(
         0.7,
         gt=0,
         lt=1,
@@ -273,10 +281,10 @@ class TrackingConfig(StageConfig):
         description="s; in a crowded place another keyframe is looked for so often at most; 0: at "
         "every frame, and the reef swum there and back takes 140 instead of 60 ms a frame there",
     )
-    mapping_parallax_widths: float = Field(
+    mapping_parallax_widths: Lab[float] = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
     )
-    matches: int = Field(
+    matches: Lab[int] = Field(
         5000,
         ge=200,
         description="matches in the pose solver; more gain nothing (notes/2026-11-tracking.md)",
@@ -341,7 +349,7 @@ class TrackingConfig(StageConfig):
         3, ge=1, description="consecutive lost frames after which a new sub-map starts"
     )
     initialisation: Lab[InitialisationConfig] = InitialisationConfig()
-    gate: GateConfig = GateConfig()
+    gate: Lab[GateConfig] = GateConfig()
     graph: Lab[GraphConfig] = GraphConfig()
     adjustment: Lab[AdjustmentConfig] = AdjustmentConfig()
     learned: Lab[LearnedConfig] = LearnedConfig()

@@ -26,7 +26,6 @@ from aquaflow.dive.calibration_pass import FoundCamera
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import IN_SITE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.dive.from_maps import held_out_examples, place_in_daylight, water_in_numbers
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -128,17 +127,26 @@ class Deliverables:
             attempt("water summary", partial(self._summarise_water, sub_map))
 
     def _summarise_water(self, sub_map: int) -> None:
+        from aquaflow.dive.map_file import summarise_water  # loads torch
+        from aquaflow.dive.white_balance import place_in_daylight
+
         mapper = self.slam.mappers[sub_map]
         if mapper.config.medium.white_balance.startswith(DAYLIGHT):
             note = place_in_daylight(mapper, self._path_rows(), sub_map)
             self.notes += [note] if note is not None and sub_map == self._main else []
-        self._waters[sub_map] = water_in_numbers(mapper)
+        self._waters[sub_map] = summarise_water(mapper)
+
+    def _examine(self, until: Deadline | None) -> list[HeldOut]:
+        if self._main not in self.slam.mappers:
+            return []
+        from aquaflow.dive.held_out import examine_held_out  # loads torch
+
+        return examine_held_out(self.slam, self._main, self._poses_m, until)
 
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""
-        main, attempt = self._main, self._attempt
-        examined = partial(held_out_examples, self.slam, main, self._poses_m, until)
-        found = attempt("evaluation", examined) or []
+        main = self._main
+        found = self._attempt("evaluation", partial(self._examine, until)) or []
         scale = self.metric_frame.T_nm.scale
         self.held_out = [held_out_in(example, scale) for example in found]
         there = len(self.slam.held_out.get(main, ()))

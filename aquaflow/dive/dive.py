@@ -291,14 +291,14 @@ class Dive:
             self._maps[number] = read_map_file(self.file(name), renderer)
         return self._maps[number]
 
-    def filled_map(self, sub_map: int | None = None) -> Mapper:
-        """As :meth:`map`.
+    def filled_map(self) -> Mapper:
+        """As :meth:`map`, of the largest sub-map.
 
         Raises:
             InputError: it is missing, damaged or empty.
             ConfigError: the dive's settings cannot be read.
         """
-        mapper = self.map(sub_map)
+        mapper = self.map()
         if not mapper.views or len(mapper.gaussians) == 0:
             raise InputError(f"the map of {self.path} is empty; map a recording that shows more")
         return mapper

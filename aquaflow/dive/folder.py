@@ -28,7 +28,6 @@ from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, DiveStatus
 from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.config import Config
-from aquaflow.dive import from_maps
 from aquaflow.dive.dive import CALIBRATION, FRAMES
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.held_out_example import HeldOut
@@ -298,7 +297,9 @@ class DiveFolder:
 
     def write_map(self, mapper: Mapper, suffix: str = "") -> None:
         """map.aqf: the exact map."""
-        from_maps.write_exact(self.path, mapper, suffix)
+        from aquaflow.dive.map_file import write_exact  # loads torch
+
+        write_exact(self.path, mapper, suffix)
 
     def write_splats(
         self, mapper: Mapper, water: WaterSummary | None, frame: WorldFrame, suffix: str = ""
@@ -308,7 +309,9 @@ class DiveFolder:
 
         ``water``: in map units.
         """
-        from_maps.write_splats(self.path, mapper, water, frame, suffix)
+        from aquaflow.dive.map_file import write_splats  # loads torch
+
+        write_splats(self.path, mapper, water, frame, suffix)
 
     def write_medium(self, content: dict[str, Any]) -> None:
         """medium.json: the water, see :func:`aquaflow.dive.results.medium_json`."""
@@ -330,15 +333,6 @@ class DiveFolder:
                 pictures["confidence"] = example.confidence
             for name, picture in pictures.items():
                 write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
-
-    def write_bytes(self, name: str, content: bytes) -> None:
-        """A file whose content is made already.
-
-        Raises:
-            InputError: it cannot be written.
-        """
-        with atomic_write(self.path / name) as stream:
-            stream.write(content)
 
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """A JSON file of the dive; a number that is not finite is unknown, null."""

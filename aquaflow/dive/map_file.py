@@ -111,7 +111,7 @@ def write_splats(
             seen = map_out(J * medium.transmission(z) + medium.backscatter(z))
             clear = _as_shown(mapper, J)
         for name, colours in (("map", seen), ("map_clear", clear)):
-            write_ply(folder / f"{name}{suffix}.ply", _placed(_splats(plain, colours), frame))
+            write_ply(folder / f"{name}{suffix}.ply", _place(_splats(plain, colours), frame))
 
 
 def clear_splats(mapper: Mapper, frame: WorldFrame) -> PlyGaussians:
@@ -119,10 +119,10 @@ def clear_splats(mapper: Mapper, frame: WorldFrame) -> PlyGaussians:
     with torch.no_grad():
         plain = mapper.scene.bake_parameters(mapper.views)
         colours = _as_shown(mapper, radiance(plain["raw_colours"]))
-    return _placed(_splats(plain, colours), frame)
+    return _place(_splats(plain, colours), frame)
 
 
-def _placed(splats: PlyGaussians, frame: WorldFrame) -> PlyGaussians:
+def _place(splats: PlyGaussians, frame: WorldFrame) -> PlyGaussians:
     return splats if frame.is_identity else splats.transform(frame.T_nm)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.arrays import sim3_to_json
 from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
@@ -348,11 +349,7 @@ def _place(
     return {
         "site_sub_map": links[0].base_sub_map,
         "unit": frame.unit,
-        "T_site_dive": {
-            "scale": float(T.scale),
-            "rotation": T.R.tolist(),
-            "translation": T.t.tolist(),
-        },
+        "T_site_dive": sim3_to_json(T),
         "sigma": {
             "position_map_units": float(np.sqrt(np.trace(covariance[:3, :3]))),
             "rotation_deg": float(np.degrees(np.sqrt(np.trace(covariance[3:6, 3:6])))),

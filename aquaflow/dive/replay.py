@@ -16,10 +16,9 @@ from aquaflow.config.stage import MountingConfig
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
-from aquaflow.recordings.playback import Event, Playback
+from aquaflow.recordings.playback import Event, Playback, read_past_failures
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, mounting_of, sources_of
-from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.time_offset import (

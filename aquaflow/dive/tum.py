@@ -67,7 +67,7 @@ class Trajectory:
         """The poses at ``chosen`` (indices or a mask)."""
         return Trajectory(self.t_s[chosen], self.positions[chosen], self.wxyz[chosen])
 
-    def transformed(self, T: Sim3) -> Trajectory:
+    def transform(self, T: Sim3) -> Trajectory:
         """The same poses in the frame that ``T`` maps to."""
         return Trajectory(
             self.t_s, T.apply(self.positions), quaternion_from_rotation(T.R @ self.R_wc)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import DamagedError
 from aquaflow.geometry.camera import CameraModel, camera_of_values
 from aquaflow.geometry.similarity import Sim3
 
@@ -17,6 +18,8 @@ Arrays = dict[str, Array]
 
 SIM3 = 13
 """Numbers of a similarity: R row by row, t, scale."""
+ROTATION_TOLERANCE = 1e-6
+"""Largest difference of R^T R from the identity in a file."""
 
 
 def of_sim3(poses: Sequence[Sim3]) -> npt.NDArray[np.float64]:
@@ -30,6 +33,27 @@ def to_sim3(
 ) -> Sim3:
     """The similarity in one row of :func:`of_sim3`."""
     return Sim3(row[:9].reshape(3, 3).copy(), row[9:12].copy(), float(row[12]))
+
+
+def sim3_to_json(T: Sim3) -> dict[str, Any]:
+    """``scale``, ``rotation`` and ``translation`` as plain values."""
+    return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
+
+
+def sim3_from_json(stated: Mapping[str, Any]) -> Sim3:
+    """The similarity that :func:`sim3_to_json` made, or that a person wrote.
+
+    Raises:
+        DamagedError, KeyError, TypeError, ValueError: it is none.
+    """
+    R = np.asarray(stated["rotation"], np.float64)
+    t = np.asarray(stated["translation"], np.float64)
+    T = Sim3(R, t, float(stated["scale"]))
+    if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite():
+        raise DamagedError("a transform is not finite")
+    if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+        raise DamagedError("a transform's rotation is none")
+    return T
 
 
 def of_camera(camera: CameraModel) -> dict[str, Any]:

@@ -81,7 +81,7 @@ class CameraModel:
         """True if neither distortion nor a port bends its rays."""
         return not self.is_distorted and self.port is None
 
-    def scaled(self, width: int, height: int) -> CameraModel:
+    def resize(self, width: int, height: int) -> CameraModel:
         """The same camera for the same picture resized to ``width`` x ``height``."""
         sx, sy = width / self.width, height / self.height
         return replace(
@@ -94,7 +94,7 @@ class CameraModel:
             cy=self.cy * sy,
         )
 
-    def cropped(self, x: int, y: int, width: int, height: int) -> CameraModel:
+    def crop(self, x: int, y: int, width: int, height: int) -> CameraModel:
         """The same camera for the part of its picture that starts at (x, y)."""
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 

@@ -41,7 +41,7 @@ class Rectifier:
             ConfigError: the distortion folds the picture over itself.
         """
         height = max(1, round(width * camera.height / camera.width))
-        self._source = camera.scaled(width, height)
+        self._source = camera.resize(width, height)
         self._maps = None
         self.camera = self._source
         """The camera of the rectified pictures."""

@@ -1,16 +1,18 @@
-"""The dive's clock across a restart: CLOCK_MONOTONIC restarts with every boot."""
+"""The dive's clock across a restart: CLOCK_MONOTONIC restarts with every boot; and UTC by it."""
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from aquaflow.base.clocks.device import Learned
+from aquaflow.base.clocks.wall import WallClockWatch
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.types import Dropped, Frame
+from aquaflow.types import Dropped, Frame, UtcTime
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """Changes with every start of the kernel, and with it the zero of the monotonic clock."""
@@ -111,3 +113,37 @@ class Continued:
         if isinstance(frame, Dropped):
             return replace(frame, index=index, t_ns=t_ns)
         return replace(frame, index=index, t_ns=t_ns)
+
+
+# --------------------------------------------------------------------------------------------------
+# The wall clock as a source of UTC, so that a recording holds what a live dive heard.
+
+SOURCE = "computer/clock"
+"""Name of the samples' source."""
+EVERY_S = 10.0
+"""A computer's clock drifts by 1e-4 at most: 1 ms."""
+OLDEST_NS = 1_735_689_600 * 1_000_000_000
+"""2025-01-01: a clock from before this program existed was never set."""
+
+
+class WallClock:
+    """Yields the wall clock every ``every_s`` until it is closed, as the computer has it: after it
+    was set, as it is then."""
+
+    def __init__(self, every_s: float = EVERY_S) -> None:
+        self._every_s = every_s
+        self._closed = threading.Event()
+        self._watch = WallClockWatch()
+
+    def samples(self) -> Iterator[UtcTime]:
+        """The first at once; none while the computer's clock was never set."""
+        while not self._closed.is_set():
+            now = self._watch.read()
+            t_ns, utc_ns = now.monotonic_ns, now.monotonic_ns + now.offset_ns
+            if utc_ns >= OLDEST_NS:
+                yield UtcTime(t_ns, t_ns, SOURCE, utc_ns)
+            self._closed.wait(self._every_s)
+
+    def close(self) -> None:
+        """End the samples."""
+        self._closed.set()

@@ -16,6 +16,7 @@ from aquaflow.base.stages import Stages
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
 from aquaflow.base.worker import Worker, core_count
 from aquaflow.config import Config, parse_config
+from aquaflow.config.service import LimitsConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
@@ -25,7 +26,7 @@ from aquaflow.live.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.live.checkpoint.generations import Checkpoint
 from aquaflow.live.checkpoint.repair import hear_again, lost_with_their_files
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.clock_reading import ClockReading, Continued
+from aquaflow.live.clock_reading import OLDEST_NS, ClockReading, Continued
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.deliverable_updates import DeliverableUpdater
 from aquaflow.live.feed import Feed, camera_mounting
@@ -39,7 +40,6 @@ from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam, make_maps
-from aquaflow.sources.wall_clock import OLDEST_NS
 from aquaflow.types import Dropped
 
 # --------------------------------------------------------------------------------------------------
@@ -147,18 +147,7 @@ def assemble(
         stated = camera_mounting(config, service, feed)
         slam.metric.mounting = stated or _mounting_of(before)
     run = DiveRun(name, folder, config, slam, feed.calibration, feed.name_of)
-    continued = Continued()
-    if choice.checkpoint is not None:
-        continued = _restore(choice.checkpoint, slam, run, maps)
-    run.notes += [*choice.notes, *losses, *said]
-    for note in run.notes:
-        log.warning("%s", note)
-    feed.continue_from(continued)
-    failures.attempt(
-        "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
-    )
-    telemetry_log = partial(TelemetryWriter, folder.path / TELEMETRY)
-    run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
+    _begin(run, choice, feed, maps, [*choice.notes, *losses, *said])
     vitals.health.begin()
     pressure = PressureReader(folder.path, gpu_free=thread.usable_memory)
     loop = LiveLoop(run, feed, thread, service, vitals, control, pressure)
@@ -171,16 +160,7 @@ def assemble(
         lambda: feed.continued.known_shift_ns,
     )  # fmt: skip
     refresher = DeliverableUpdater(run, thread, service.checkpoint.deliverables_s)
-
-    def write_what_is_due(live: LiveLoop) -> None:
-        disk_is_full = live.pressure.disk_is_full(service.limits)
-        checkpointer.take_if_due(disk_is_full)
-        refresher.write_if_due(disk_is_full)
-
-    def note_pause() -> None:
-        checkpointer.take_soon()
-        refresher.write_soon()
-
+    write_what_is_due, note_pause = _writers(checkpointer, refresher, service.limits)
     standing = DiveStatusFile(folder.path, failures, slam.metric.mounting, before, note_pause)
     errors = DeviceErrors(feed.describe)
     loop.watchers += [standing.update, write_what_is_due, lambda live: errors.update()]
@@ -188,6 +168,44 @@ def assemble(
     return Parts(
         loop, slam, run, thread, checkpointer, refresher, choice, standing, errors, frames_before
     )  # fmt: skip
+
+
+def _writers(
+    checkpointer: Checkpointer, refresher: DeliverableUpdater, limits: LimitsConfig
+) -> tuple[Callable[[LiveLoop], None], Callable[[], None]]:
+    """What writes checkpoint and deliverables after a turn of the loop, and what a pause asks."""
+
+    def write_what_is_due(live: LiveLoop) -> None:
+        disk_is_full = live.pressure.disk_is_full(limits)
+        checkpointer.take_if_due(disk_is_full)
+        refresher.write_if_due(disk_is_full)
+
+    def note_pause() -> None:
+        checkpointer.take_soon()
+        refresher.write_soon()
+
+    return write_what_is_due, note_pause
+
+
+def _begin(run: DiveRun, choice: Choice, feed: Feed, maps: OwnedMaps, notes: list[str]) -> None:
+    """Bring the run to where its checkpoint has it, with ``notes`` on that, and open its files.
+
+    Raises:
+        UnusableStateError: the dive cannot be resumed from the checkpoint.
+    """
+    continued = Continued()
+    if choice.checkpoint is not None:
+        continued = _restore(choice.checkpoint, run.slam, run, maps)
+    run.notes += notes
+    for note in run.notes:
+        log.warning("%s", note)
+    feed.continue_from(continued)
+    folder, failures = run.folder, feed.failures
+    failures.attempt(
+        "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
+    )
+    telemetry_log = partial(TelemetryWriter, folder.path / TELEMETRY)
+    run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
 
 
 def _mounting_of(before: DiveStatus | None) -> MountingConfig | None:

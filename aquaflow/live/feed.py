@@ -30,15 +30,13 @@ from aquaflow.config import Config, SourceConfig
 from aquaflow.config.service import ServiceConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.live.clock_reading import Continued
+from aquaflow.live.clock_reading import Continued, WallClock
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples
-from aquaflow.recordings.playback import Event, Playback, delay_event
+from aquaflow.recordings.playback import Event, Playback, delay_event, read_past_failures
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, HearsPilot, OutboundMessage
-from aquaflow.sources.reading import read_past_failures
-from aquaflow.sources.wall_clock import WallClock
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)

@@ -331,7 +331,7 @@ def halve(growth: Growth) -> Growth:
     width, height = view.camera.width // 2, view.camera.height // 2
     small = view.with_pixels(
         _picture(view, width, height),
-        view.camera.scaled(width, height),
+        view.camera.resize(width, height),
         None if view.mask is None else view.mask[1 : 2 * height : 2, 1 : 2 * width : 2].copy(),
     )
     pointmap = growth.pointmap

@@ -81,7 +81,7 @@ def choose(mapper: Mapper, choice: str | Grey) -> None:
     fitted = mapper.scene.balance is not None
     looks = _looks(mapper, find_light=fitted and choice == NEUTRAL)
     if isinstance(choice, Grey):
-        _set_white(mapper.scene, _white_of(mapper, choice.name, _said(choice), choice))
+        _set_white(mapper.scene, _white_of(mapper, choice.name, _illuminant_of(choice), choice))
     elif (light := looks.light or _daylight(mapper, choice)) is not None:
         _set_white(mapper.scene, _white_of(mapper, choice, light))
     gain = np.ones(3) if mapper.scene.balance is None else mapper.scene.balance.chosen.gain
@@ -93,7 +93,7 @@ def _set_white(scene: Scene, white: ChosenWhite) -> None:
         scene.balance = replace(scene.balance, chosen=white)
 
 
-def _said(grey: Grey) -> Illuminant:
+def _illuminant_of(grey: Grey) -> Illuminant:
     log = np.log(grey.colour)
     return Illuminant(log - log.mean(), np.zeros(3))
 
@@ -166,7 +166,7 @@ def _looks(mapper: Mapper, find_light: bool) -> _Looks:
         own = restored_own(mapper.scene, view, shown)
         samples.append(seen_and_clear(view, shown, own))
         if find_light:
-            picture, weight = _weighted(mapper.scene, view, shown, own)
+            picture, weight = _weigh(mapper.scene, view, shown, own)
             if (found := methods_in(picture, weight)) is not None:
                 said.append(found)
                 weights.append(float(weight.sum()))
@@ -184,7 +184,7 @@ def seen_and_clear(view: View, shown: RenderedMap, own: Recovered) -> tuple[Arra
     return picture_out(seen).astype(np.float64), picture_out(clear).astype(np.float64)
 
 
-def _weighted(
+def _weigh(
     scene: Scene, view: View, shown: RenderedMap, own: Recovered
 ) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
     """[H, W, 3] the map from the view without its water, and [H, W] how much each pixel says of the

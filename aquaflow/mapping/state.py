@@ -319,7 +319,7 @@ def copy_map(mapper: Mapper) -> MapCopy:
     """In the mapping thread: a copy; a tenth of a second for 150,000 Gaussians."""
     tensors = mapper.gaussians.parameters
     plain = {name: map_out(tensor) for name, tensor in tensors.items()}
-    clear, tone = _toned(mapper, tensors)
+    clear, tone = _apply_tone(mapper, tensors)
     view = mapper.views[-1]
     water = mapper.scene.water(view)
     rows = None
@@ -330,7 +330,7 @@ def copy_map(mapper: Mapper) -> MapCopy:
     return MapCopy(plain, steps, clear, rows, mapper.scene.lamp, tone, poses)
 
 
-def _toned(
+def _apply_tone(
     mapper: Mapper,
     tensors: Mapping[str, Tensor],  # of a GaussianMap
 ) -> tuple[npt.NDArray[np.float32], ShownTone]:

@@ -14,7 +14,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.depth_describer import DepthDescriber, as_input, multiple_of, resize
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.mast3r.describer import Mast3rDescriber
+from aquaflow.prior.mast3r_describer import Mast3rDescriber
 from aquaflow.prior.network import MOST_LOG, Describer, Half, LearnedRange, Picture, cell_rays, unit
 from aquaflow.prior.oracle import OracleDescriber
 from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings

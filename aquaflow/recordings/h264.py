@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.recordings.decoder_log import DecoderLog
+from aquaflow.recordings.video_decoder import DecoderLog
 
 NAL_START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 """Start code of Annex B, and the first byte of the unit that follows."""

@@ -25,7 +25,6 @@ from aquaflow.geometry.camera import (
     guess_camera,
     has_unmeasured_port,
 )
-from aquaflow.recordings.camera_info import camera_of_info, choose_topic, info_topic, is_rectified
 from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
 from aquaflow.recordings.picture import (
@@ -37,7 +36,13 @@ from aquaflow.recordings.picture import (
     stated_white,
     to_rgb,
 )
-from aquaflow.recordings.picture_message import raw_picture
+from aquaflow.recordings.picture_message import (
+    camera_of_info,
+    choose_topic,
+    info_topic,
+    is_rectified,
+    raw_picture,
+)
 from aquaflow.recordings.rosbag import stamp_of
 from aquaflow.sources import is_asked
 from aquaflow.types import Dropped, EncodedPicture, Frame

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, cast
 
 from aquaflow.base.errors import InputError
-from aquaflow.recordings.dive_file import require_mcap
 
 if TYPE_CHECKING:
     from mcap.records import Channel, Chunk, McapRecord, Message, Schema
@@ -25,6 +25,19 @@ HEAD = 2000
 
 ATTEMPTS = 2
 """At a chunk, which may hold a second of pictures."""
+
+
+def require_mcap() -> None:
+    """Check that the libraries of the extra ``recording`` are installed.
+
+    Raises:
+        InputError: mcap or foxglove's schemas are not installed.
+    """
+    for module in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"):
+        if find_spec(module) is None:
+            raise InputError(
+                f"MCAP files need {module}; install it with pip install 'aquaflow[recording]'"
+            )
 
 
 @dataclass(frozen=True)

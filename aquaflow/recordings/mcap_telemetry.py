@@ -12,7 +12,7 @@ from aquaflow.recordings.mcap_camera import McapCamera, Payloads, UnreadablePayl
 from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
 from aquaflow.recordings.rosbag import stamp_of
 from aquaflow.recordings.rosbag_telemetry import CONVERSIONS
-from aquaflow.recordings.telemetry_json import sample_from_json
+from aquaflow.recordings.telemetry_lines import sample_from_json
 from aquaflow.recordings.telemetry_log import DecodedReads, LoggedUtc, Read
 from aquaflow.types import KINDS, TelemetrySample
 

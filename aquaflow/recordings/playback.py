@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, dropwhile
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.config import SourceConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.types import Dropped, Frame, TelemetrySample
@@ -98,3 +99,52 @@ def delay_event(event: Event, shift_ns: int, now_ns: int) -> Event:
     if isinstance(event, Dropped):
         return replace(event, t_ns=event.t_ns + shift_ns)
     return replace(event, t_ns=event.t_ns + shift_ns, arrival_ns=now_ns)
+
+
+# --------------------------------------------------------------------------------------------------
+# Past frames on which a reader raises; only these frames are lost.
+
+Read = TypeVar("Read", bound=Event)
+
+MOST_UNREADABLE = 5
+"""Frames in a row that a recording fails on until the rest is given up."""
+
+
+def read_past_failures(
+    read: Callable[[int], Iterator[Read]],
+    start: int,
+    source: SourceConfig,
+    frame_count: int | None,
+    failures: Failures,
+    give_up: Callable[[int], object],
+) -> Iterator[Read | Dropped]:
+    """Events of ``read(start)``; after a frame on which it raises, reading continues with the next.
+
+    ``give_up`` is called with the next frame after ``MOST_UNREADABLE`` failures in a row.
+
+    Raises:
+        Exception: the error of the reader, if the recording fails before its first frame.
+    """
+    ends = [end for end in (frame_count, source.stop) if end is not None]
+    t_ns, failed_in_a_row, any_read = 0, 0, False
+    events = read(start)
+    while failed_in_a_row < MOST_UNREADABLE:
+        with failures.contain("reading", start) as reading:
+            event = next(events, None)
+        if reading.error is not None:
+            if not any_read:
+                raise reading.error
+            if ends and start >= min(ends):
+                return  # closing failed after the last frame
+            failed_in_a_row += 1
+            yield Dropped(start, t_ns, "reading failed, see log.jsonl")
+            start += source.every
+            events = read(start)
+            continue
+        if event is None:
+            return
+        if isinstance(event, (Frame, Dropped)):
+            any_read, failed_in_a_row = True, 0
+            start, t_ns = event.index + source.every, event.t_ns
+        yield event
+    give_up(start)

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.recordings.camera_info import choose_topic
+from aquaflow.recordings.picture_message import choose_topic
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

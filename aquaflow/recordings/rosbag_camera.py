@@ -11,13 +11,6 @@ import numpy as np
 
 from aquaflow.base.errors import InputError, printable
 from aquaflow.geometry.camera import CameraModel, guess_camera
-from aquaflow.recordings.camera_info import (
-    CAMERA_INFO,
-    camera_of_info,
-    choose_topic,
-    info_topic,
-    is_rectified,
-)
 from aquaflow.recordings.picture import (
     Stored,
     UnreadablePictureError,
@@ -26,7 +19,14 @@ from aquaflow.recordings.picture import (
     received_as,
     stated_white,
 )
-from aquaflow.recordings.picture_message import raw_picture
+from aquaflow.recordings.picture_message import (
+    CAMERA_INFO,
+    camera_of_info,
+    choose_topic,
+    info_topic,
+    is_rectified,
+    raw_picture,
+)
 from aquaflow.recordings.rosbag import (
     COMPRESSED,
     decode,

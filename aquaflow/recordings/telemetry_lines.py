@@ -1,4 +1,4 @@
-"""telemetry.jsonl: the telemetry of a live dive, one sample a line, in the order of arrival.
+"""Telemetry samples as JSON, and telemetry.jsonl: those of a live dive, a line each as they arrive.
 
 A line is the sample's JSON object with its ``kind``. A line that was cut off, or damaged, costs
 itself.
@@ -9,13 +9,72 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from aquaflow.base.errors.regular_file import open_regular
 from aquaflow.base.storage.atomic import is_cut_short, open_to_append
-from aquaflow.recordings.telemetry_json import sample_from_values, sample_to_json
-from aquaflow.types import KIND_OF, TelemetrySample
+from aquaflow.types import KIND_OF, KINDS, LENGTHS, STAMP, VALUES, TelemetrySample
+
+
+def sample_schema(kind: str) -> bytes:
+    """JSON schema of one kind of sample."""
+    properties: dict[str, Any] = {
+        "t_ns": {"type": "integer", "description": "CLOCK_MONOTONIC of the measurement"},
+        "arrival_ns": {"type": "integer", "description": "CLOCK_MONOTONIC of its arrival"},
+        "source": {"type": "string"},
+    }
+    for field in fields(KINDS[kind]):
+        number: dict[str, Any] = {"type": "integer" if field.name == "utc_ns" else "number"}
+        length = LENGTHS.get(field.name)
+        if length is not None:
+            number = {"type": "array", "items": number, "minItems": length, "maxItems": length}
+        properties.setdefault(field.name, number)
+    schema = {"title": KINDS[kind].__name__, "type": "object", "properties": properties}
+    return json.dumps(schema | {"required": list(properties)}).encode()
+
+
+def sample_to_json(sample: TelemetrySample) -> bytes:
+    """The sample as one JSON object; floats keep every bit.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    return json.dumps(vars(sample), allow_nan=False, separators=(",", ":")).encode()
+
+
+def sample_from_json(kind: str, data: bytes) -> TelemetrySample:
+    """The sample that ``sample_to_json`` wrote.
+
+    Raises:
+        ValueError: the data are not such a sample.
+    """
+    return sample_from_values(kind, json.loads(data))
+
+
+def sample_from_values(kind: str, values: Mapping[str, Any]) -> TelemetrySample:
+    """The sample that a parsed JSON object holds.
+
+    Raises:
+        ValueError: it holds no such sample.
+    """
+    try:
+        sample_type = KINDS[kind]
+        known = {name: values[name] for name in (*STAMP, *VALUES[sample_type])}
+        for name, length in LENGTHS.items():
+            if name in known:
+                known[name] = tuple(float(value) for value in known[name])
+                if len(known[name]) != length:
+                    raise ValueError(f"{name} holds {len(known[name])} values, not {length}")
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"not a sample of kind {kind}") from error
+    return sample_type(**known)
+
+
+# --------------------------------------------------------------------------------------------------
+# The file of a dive.
 
 log = logging.getLogger(__name__)
 

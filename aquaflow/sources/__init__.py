@@ -123,7 +123,7 @@ class LiveSource(CameraSource, Protocol):
     """A camera source that opens a device; ``frames`` yields the newest picture until ``close``."""
 
     @classmethod
-    def configured(cls, name: str, config: Any) -> LiveSource:
+    def from_config(cls, name: str, config: Any) -> LiveSource:
         """The camera that ``config`` of this driver's kind describes; opens nothing yet."""
         ...
 
@@ -235,7 +235,7 @@ def open_camera(name: str, config: CameraConfig) -> LiveSource:
     for entry in entry_points(group=CAMERAS):
         if entry.name == config.kind:
             driver: type[LiveSource] = entry.load()
-            return driver.configured(name, config)
+            return driver.from_config(name, config)
     raise InputError(f"no driver for cameras of kind '{config.kind}'; reinstall aquaflow")
 
 

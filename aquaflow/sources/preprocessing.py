@@ -144,9 +144,9 @@ def fit_calibration(
     if calibration is None:
         return guess_camera(width, height)
     if _same_shape(calibration, width, height):
-        return calibration.scaled(width, height)
+        return calibration.resize(width, height)
     if _same_shape(calibration, *size):
-        return calibration.scaled(*size).cropped(x, y, width, height)
+        return calibration.resize(*size).crop(x, y, width, height)
     raise ConfigError(
         f"the calibration is for {calibration.width} x {calibration.height} pictures, these are "
         f"{width} x {height}; calibrate at this shape or choose the --crop that it was made for"

@@ -11,7 +11,7 @@ from aquaflow.dive.deliverables import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.finished_dive import numbers_at_the_end
 from aquaflow.survey.measure.reef_numbers import write_reef_numbers
-from aquaflow.survey.report import write_report
+from aquaflow.survey.report.page import write_report
 from aquaflow.survey.report.report_of import OVERVIEW, report_of
 
 

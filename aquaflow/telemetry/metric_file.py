@@ -16,7 +16,7 @@ import numpy as np
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.arrays import sim3_from_json, sim3_to_json
 from aquaflow.telemetry.world_frame import North, Origin, SourceReport, WorldFrame
 
 NAME = "metric.json"
@@ -81,19 +81,15 @@ def frame_to_json(frame: WorldFrame) -> dict[str, Any]:
         "level": bool(frame.level),
         "north": frame.north,
         "depth_known": bool(frame.depth_known),
-        "T_nm": _of_sim3(T),
+        "T_nm": sim3_to_json(T),
         "covariance": frame.covariance.tolist(),
-        "T_bc": None if T_bc is None else _of_sim3(T_bc),
+        "T_bc": None if T_bc is None else sim3_to_json(T_bc),
         "origin": None if frame.origin is None else asdict(frame.origin),
         "scale_source": frame.scale_source,
         "sources": [asdict(source) for source in frame.sources],
         **({"clock_offset_s": frame.clock_offset_s} if frame.clock_offset_s else {}),
         **({"site": frame.site} if frame.site else {}),
     }
-
-
-def _of_sim3(T: Sim3) -> dict[str, Any]:
-    return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
 
 
 def _read(folder: Path) -> dict[int, tuple[str, WorldFrame]]:
@@ -131,27 +127,16 @@ def frame_of_json(stated: dict[str, Any]) -> WorldFrame:
         raise DamagedError("north is none of the words that the format has")
     origin, T_bc = stated["origin"], stated["T_bc"]
     return WorldFrame(
-        T_nm=_to_sim3(stated["T_nm"]),
+        T_nm=sim3_from_json(stated["T_nm"]),
         covariance=covariance,
         metric=bool(stated["metric"]),
         level=bool(stated["level"]),
         north=stated["north"],
         depth_known=bool(stated["depth_known"]),
         origin=None if origin is None else Origin(**origin),
-        T_bc=None if T_bc is None else _to_sim3(T_bc),
+        T_bc=None if T_bc is None else sim3_from_json(T_bc),
         scale_source=str(stated["scale_source"]),
         sources=tuple(SourceReport(**source) for source in stated["sources"]),
         clock_offset_s=float(stated.get("clock_offset_s", 0.0)),
         site=str(stated.get("site", "")),
     )
-
-
-def _to_sim3(stated: dict[str, Any]) -> Sim3:
-    R = np.asarray(stated["rotation"], np.float64)
-    t = np.asarray(stated["translation"], np.float64)
-    T = Sim3(R, t, float(stated["scale"]))
-    if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite():
-        raise DamagedError("a transform is not finite")
-    if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
-        raise DamagedError("a transform's rotation is none")
-    return T

@@ -108,7 +108,7 @@ class NewDepths(Protocol):
         """True of a frame whose pose was solved against the old depths."""
         ...
 
-    def carried(self, T_kf: Sim3) -> Sim3:
+    def correct(self, T_kf: Sim3) -> Sim3:
         """The pose of such a frame in the keyframe, against the new ones."""
         ...
 

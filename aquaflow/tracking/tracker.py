@@ -185,14 +185,14 @@ class Tracker:
             self._waiting.put([frame], Wait.IN_HAND)
         edges, self._edges = self._edges, Step()
         leaving = self._hold_lost(self._waiting.settle(decided, self._as_lost))
-        return replace(edges, frames=[self._carried(each, edges) for each in leaving])
+        return replace(edges, frames=[self._correct(each, edges) for each in leaving])
 
-    def _carried(self, tracked: Tracked, edges: Step) -> Tracked:
+    def _correct(self, tracked: Tracked, edges: Step) -> Tracked:
         """The frame as the depths that this step has changed put it."""
         for depths in edges.new_depths:
             if tracked.T_wc is not None and depths.concerns(tracked):
                 T_wk = self._keyframes[depths.keyframe].T_wc
-                T_kf = depths.carried(T_wk.inverse() @ tracked.T_wc)
+                T_kf = depths.correct(T_wk.inverse() @ tracked.T_wc)
                 return replace(tracked, T_wc=(T_wk @ T_kf).if_finite())
         return tracked
 

@@ -86,7 +86,7 @@ class OakCamera(LiveCamera):
         super().__init__(name, config, self._open_device)
 
     @classmethod
-    def configured(cls, name: str, config: OakConfig) -> OakCamera:
+    def from_config(cls, name: str, config: OakConfig) -> OakCamera:
         """The camera of :func:`aquaflow.sources.open_camera`."""
         return cls(name, config)
 

@@ -18,7 +18,7 @@ class StreamCamera(LiveCamera):
         super().__init__(name, config, lambda: open_stream(name, config))
 
     @classmethod
-    def configured(cls, name: str, config: StreamConfig) -> StreamCamera:
+    def from_config(cls, name: str, config: StreamConfig) -> StreamCamera:
         """The camera of :func:`aquaflow.sources.open_camera`."""
         return cls(name, config)
 

@@ -266,7 +266,7 @@ class V4l2Camera(LiveCamera):
         super().__init__(name, config, self._open_device)
 
     @classmethod
-    def configured(cls, name: str, config: V4l2Config) -> V4l2Camera:
+    def from_config(cls, name: str, config: V4l2Config) -> V4l2Camera:
         """The camera of :func:`aquaflow.sources.open_camera`."""
         return cls(name, config)
 

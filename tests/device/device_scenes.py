@@ -43,7 +43,7 @@ ALL_PARTS: dict[str, dict[str, Any]] = {
 """Everything that a map can have, in few steps."""
 
 
-SMALL = CAMERA.scaled(32, 24)
+SMALL = CAMERA.resize(32, 24)
 WHERE = (CPU, PRETENDED)
 
 

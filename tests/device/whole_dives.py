@@ -12,7 +12,8 @@ from aquaflow.config.presets import merge
 from aquaflow.dive.replay import map_recording
 from aquaflow.dive.run import Finished
 from aquaflow.lab.bench.ci_suite import dim_light
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.sources import open_recording
 from tests.device.device_scenes import ALL_PARTS
 from tests.device.gsplats_place import machine_with

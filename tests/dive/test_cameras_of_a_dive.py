@@ -12,7 +12,8 @@ from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.camera import load_camera
 from aquaflow.geometry.port import FlatPort
 from aquaflow.lab.evaluation.protocol import evaluate_dive
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.sources import open_recording
 
 SMALL = {"frames": 16, "width": 160, "height": 120, "supersampling": 1, "speed_m_s": 0.4}

@@ -13,7 +13,7 @@ import aquaflow
 from aquaflow.base.errors import InputError
 from aquaflow.dive.deliverables import read_finished_frames
 from aquaflow.dive.dive import Dive
-from aquaflow.survey.report import render_report
+from aquaflow.survey.report.page import render_report
 from aquaflow.survey.report.report_of import report_of
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.base.storage.dive_status import DiveState, read_status, unfinished_reason
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
@@ -211,20 +212,25 @@ def test_a_folder_that_was_cut_off_before_its_table_can_be_mapped_into_again(
         assert (tmp_path / "frames.csv").exists()
 
 
+def write(path: Path, content: bytes) -> None:
+    with atomic_write(path) as stream:
+        stream.write(content)
+
+
 def test_deliverables_that_were_not_written_again_are_set_aside_until_they_are(
     tmp_path: Path,
 ) -> None:
     with opened(tmp_path / "dive") as folder:
         for name in ("map.ply", "report.html"):
-            folder.write_bytes(name, b"old")
+            write(folder.path / name, b"old")
         before = folder.deliverables()
-        folder.write_bytes("report.html", b"new")
+        write(folder.path / "report.html", b"new")
         folder.set_aside(before)
         assert not (folder.path / "map.ply").exists()
         assert (folder.path / "map.earlier.ply").read_bytes() == b"old"
         assert (folder.path / "report.html").read_bytes() == b"new"
         before = folder.deliverables()
         for name in ("map.ply", "report.html"):
-            folder.write_bytes(name, b"newer")
+            write(folder.path / name, b"newer")
         folder.set_aside(before)
         assert list(folder.path.glob("*.earlier.*")) == []

@@ -10,7 +10,8 @@ import pytest
 from aquaflow.config import Config, parse_config
 from aquaflow.dive import calibration_pass
 from aquaflow.dive.replay import map_recording
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.tracking.lens_equations import LensView

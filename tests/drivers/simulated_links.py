@@ -293,8 +293,8 @@ class Running:
         return list(self.telemetry.samples())
 
 
-def telemetry_config(rig: Rig, **settings: Any) -> TelemetryConfig:
-    return parse_telemetry({"devices": {"device": rig.config}, **settings}, "test")
+def telemetry_config(rig: Rig) -> TelemetryConfig:
+    return parse_telemetry({"devices": {"device": rig.config}}, "test")
 
 
 @contextmanager

@@ -16,11 +16,11 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import StreamConfig
 from aquaflow.drivers.stream.session import session_of
 from aquaflow.drivers.stream.udp_port import Port, bound, first_packet
-from aquaflow.recordings.transport_stream import UdpCamera
 from aquaflow.sim_drivers import rtp_camera as rtp_packets
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed, Shot, first_images
 from aquaflow.sim_drivers.h264_writer import units
 from aquaflow.sim_drivers.rtp_camera import RtpCamera
+from aquaflow.sim_drivers.transport_stream import UdpCamera
 from aquaflow.types import Dropped, Frame
 from tests.drivers.camera_scenes import (
     HEIGHT,

@@ -16,11 +16,11 @@ from aquaflow.base.errors import InputError
 from aquaflow.drivers import ffmpeg
 from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.stream.session import for_logs
-from aquaflow.recordings.transport_stream import UdpCamera
 from aquaflow.sim_drivers import mjpeg_server
 from aquaflow.sim_drivers.camera_feed import CameraFeed, Shot, first_images
 from aquaflow.sim_drivers.mjpeg_server import MjpegServer
 from aquaflow.sim_drivers.rtp_camera import RtspCamera
+from aquaflow.sim_drivers.transport_stream import UdpCamera
 from aquaflow.types import Frame
 from tests.drivers.camera_scenes import (
     COUNT,

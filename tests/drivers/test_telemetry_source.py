@@ -56,9 +56,10 @@ def test_several_devices_are_heard_at_once_in_the_order_of_arrival(tmp_path):
         assert arrivals == sorted(arrivals)
 
 
-def test_the_oldest_samples_give_way_and_are_counted(tmp_path):
+def test_the_oldest_samples_give_way_and_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr("aquaflow.drivers.telemetry.QUEUE_SAMPLES", 10)
     rig = RIGS["nmea_pty"](tmp_path)
-    telemetry = LinkTelemetry(telemetry_config(rig, queue_samples=10))
+    telemetry = LinkTelemetry(telemetry_config(rig))
     device = SimulatedDevice(rig.protocol, rig.wire, motion(), None)
     until(lambda: telemetry.links["device"].is_open)
 

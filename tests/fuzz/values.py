@@ -43,7 +43,6 @@ ABSURD_PATHS = (
 """``null``, ``full`` and ``loop`` are links in the folder where a command runs."""
 
 ONLY: dict[str, tuple[str, ...]] = {
-    "opensplat": ("false", "true", "", "no-such-program", "'", "cat", "echo {}", "echo 1"),
     "cluster": ("127.0.0.1:9", "", "é", "-1", "ray://127.0.0.1:9"),
     "url": (
         *("http://127.0.0.1:1", "http://[::1]:1", "127.0.0.1", "", "http://", "http://127.0.0.1:x"),

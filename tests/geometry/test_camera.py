@@ -68,21 +68,21 @@ def test_the_top_left_pixel_has_its_centre_at_a_half() -> None:
 def test_a_resized_camera_sees_every_point_at_the_resized_pixel(width: int, height: int) -> None:
     point = np.array([0.4, -0.3, 1.7])
     factor = np.array([width / CAMERA.width, height / CAMERA.height])
-    resized = CAMERA.scaled(width, height)
+    resized = CAMERA.resize(width, height)
     assert (resized.width, resized.height) == (width, height)
     np.testing.assert_allclose(resized.project(point), CAMERA.project(point) * factor)
 
 
 def test_a_cropped_camera_sees_every_point_moved_by_the_crop() -> None:
     point = np.array([0.4, -0.3, 1.7])
-    cropped = CAMERA.cropped(100, 60, 320, 240)
+    cropped = CAMERA.crop(100, 60, 320, 240)
     assert (cropped.width, cropped.height) == (320, 240)
     np.testing.assert_allclose(cropped.project(point), CAMERA.project(point) - [100, 60])
 
 
 def test_cropping_then_resizing_is_resizing_then_cropping() -> None:
-    first = CAMERA.cropped(100, 60, 320, 240).scaled(160, 120)
-    second = CAMERA.scaled(320, 240).cropped(50, 30, 160, 120)
+    first = CAMERA.crop(100, 60, 320, 240).resize(160, 120)
+    second = CAMERA.resize(320, 240).crop(50, 30, 160, 120)
     assert first == second
 
 

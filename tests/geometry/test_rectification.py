@@ -182,7 +182,7 @@ def test_a_picture_without_distortion_is_only_resized() -> None:
     camera = CameraModel(320, 240, 260.0, 260.0, 160.0, 120.0)
     image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     rectifier = Rectifier(camera, 160)
-    assert rectifier.camera == camera.scaled(160, 120)
+    assert rectifier.camera == camera.resize(160, 120)
     np.testing.assert_array_equal(
         rectifier(image), cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA)
     )

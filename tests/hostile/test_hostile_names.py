@@ -11,7 +11,7 @@ import pytest
 from aquaflow.base.errors import printable
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.frames_csv import read_rows
-from aquaflow.survey.report import render_report
+from aquaflow.survey.report.page import render_report
 from aquaflow.survey.report.report_of import report_of
 from tests.command_line import Cli, refused
 from tests.small_recording import HASTY

@@ -21,7 +21,8 @@ TIMEOUT_S = float(os.environ.get("AQUAFLOW_VM_TIMEOUT_S", "1800"))
 @functools.cache
 def results() -> tuple[dict[str, str], str]:
     """What the job in the guest said of each step, and the end of its console."""
-    from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+    from aquaflow.lab.synthetic.config import SyntheticConfig
+    from aquaflow.lab.synthetic.dive import write_dive
 
     shutil.rmtree(MACHINE / "recording", ignore_errors=True)
     write_dive(MACHINE / "recording", SyntheticConfig.model_validate(DIVE))

@@ -9,7 +9,8 @@ import time
 from functools import partial
 from pathlib import Path
 
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from tests.kills.campaign import COMMANDS, attack
 from tests.kills.commands import Bench
 from tests.small_recording import FRAMES, HEIGHT, WIDTH

@@ -19,7 +19,8 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.spill import read_item
 from aquaflow.dive.frames_csv import FrameRow, readable_rows
 from aquaflow.dive.run import Finished
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.live.checkpoint.generations import STATE, Checkpoint
 from aquaflow.live.checkpoint.resume import newest_usable
 from aquaflow.live.clock_reading import Continued

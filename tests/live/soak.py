@@ -24,7 +24,8 @@ import numpy as np
 
 from aquaflow.config.service import ListenConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.feed import ASK_S, _Pumps
 from aquaflow.live.health.http import HealthServer, ask

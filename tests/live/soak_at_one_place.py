@@ -162,5 +162,5 @@ if __name__ == "__main__":
     parser.add_argument("--width", type=int, default=CAMERA.width)
     parser.add_argument("--map", action="store_true")
     asked = parser.parse_args()
-    camera = CAMERA.scaled(asked.width, asked.width * CAMERA.height // CAMERA.width)
+    camera = CAMERA.resize(asked.width, asked.width * CAMERA.height // CAMERA.width)
     soak(asked.frames, asked.folder, OnePlace(camera=camera), asked.map)

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from aquaflow.dive.frames_csv import read_rows
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from tests.live.killed_dives import kill_and_resume
 
 

@@ -105,7 +105,7 @@ def bytes_of_arrays() -> int:
 
 
 def test_memory_after_2000_views_is_that_after_500(tmp_path: Path) -> None:
-    camera, store = CAMERA.scaled(192, 144), ViewStore(tmp_path, resident=256)
+    camera, store = CAMERA.resize(192, 144), ViewStore(tmp_path, resident=256)
     views: list[View] = []
     sizes, traced = [], []
     tracemalloc.start()

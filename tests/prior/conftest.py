@@ -15,9 +15,3 @@ def no_sift(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("SIFT ran though the network's matches were good")
 
     monkeypatch.setattr(homography, "detect", refuse)
-
-
-@pytest.fixture(scope="session")
-def onnxscript() -> None:
-    """Its import takes seconds: only where a test runs, not where tests are collected."""
-    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import RangeUnit
-from aquaflow.prior.mast3r.describer import CELL_PX
+from aquaflow.prior.mast3r_describer import CELL_PX
 from aquaflow.prior.network import LearnedRange, unit
 
 SIDE_PX = 24

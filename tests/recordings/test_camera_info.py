@@ -11,7 +11,12 @@ import pytest
 import yaml
 
 from aquaflow.geometry.camera import CameraModel, load_camera, save_camera
-from aquaflow.recordings.camera_info import camera_of_info, choose_topic, info_topic, is_rectified
+from aquaflow.recordings.picture_message import (
+    camera_of_info,
+    choose_topic,
+    info_topic,
+    is_rectified,
+)
 
 
 def info(**changes: Any) -> SimpleNamespace:

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.recordings.decoder_log import DecoderLog
 from aquaflow.recordings.video import VideoFile
+from aquaflow.recordings.video_decoder import DecoderLog
 from aquaflow.sources import camera_reader
 from aquaflow.types import Frame
 

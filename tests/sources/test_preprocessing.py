@@ -74,7 +74,7 @@ def test_the_crop_keeps_its_part_of_the_picture(crop: str, first_red: int) -> No
 
 def test_a_calibration_of_the_whole_picture_is_cropped() -> None:
     camera = fit_calibration(WHOLE, (640, 240), (320, 0, 320, 240))
-    assert camera == WHOLE.cropped(320, 0, 320, 240)
+    assert camera == WHOLE.crop(320, 0, 320, 240)
 
 
 def test_a_calibration_of_the_crop_is_taken_as_it_is() -> None:
@@ -82,10 +82,10 @@ def test_a_calibration_of_the_crop_is_taken_as_it_is() -> None:
 
 
 def test_a_calibration_at_another_resolution_is_scaled() -> None:
-    half = fit_calibration(HALF.scaled(1280, 960), (640, 240), (0, 0, 320, 240))
-    whole = fit_calibration(WHOLE.scaled(1280, 480), (640, 240), (320, 0, 320, 240))
+    half = fit_calibration(HALF.resize(1280, 960), (640, 240), (0, 0, 320, 240))
+    whole = fit_calibration(WHOLE.resize(1280, 480), (640, 240), (320, 0, 320, 240))
     assert half == HALF
-    assert whole == WHOLE.cropped(320, 0, 320, 240)
+    assert whole == WHOLE.crop(320, 0, 320, 240)
 
 
 def test_a_rounded_height_still_fits() -> None:
@@ -183,7 +183,7 @@ def test_the_default_width_shrinks_and_never_enlarges() -> None:
 def test_the_asked_width_is_made_and_the_camera_fits_the_picture() -> None:
     result = prepared(frame(), HALF, crop="left", width=160)
     assert result.image.shape == (120, 160, 3)
-    assert result.camera == HALF.scaled(160, 120)
+    assert result.camera == HALF.resize(160, 120)
 
 
 def test_everything_but_picture_camera_and_mask_is_kept() -> None:

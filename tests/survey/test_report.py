@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from aquaflow.survey.report import (
+from aquaflow.survey.report.data import (
     CameraSummary,
     HeldOutExample,
     Measures,
@@ -20,9 +20,8 @@ from aquaflow.survey.report import (
     PathPlot,
     ReefRow,
     ReportData,
-    render_report,
-    write_report,
 )
+from aquaflow.survey.report.page import render_report, write_report
 from aquaflow.telemetry.world_frame import SourceReport
 
 CAMERA = CameraSummary(640, 360, 544.0, "guessed")

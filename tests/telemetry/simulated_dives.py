@@ -14,8 +14,8 @@ from aquaflow.config import FusionConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
-from aquaflow.lab.synthetic import SimulatedDive, SyntheticConfig, simulate
-from aquaflow.lab.synthetic.dive import CELL_M
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import CELL_M, SimulatedDive, simulate
 from aquaflow.lab.synthetic.site import site_of
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.estimator import Estimate, estimate

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.estimator import Estimate
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import SourceReport

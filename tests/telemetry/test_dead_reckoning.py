@@ -11,7 +11,7 @@ import pytest
 
 from aquaflow.config import FusionConfig
 from aquaflow.geometry.alignment import align
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import ConfigError
 from aquaflow.config import FusionConfig, parse_config
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.building import declination_of
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.types import Attitude, Position, UtcTime

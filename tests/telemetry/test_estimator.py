@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
 from aquaflow.geometry.earth import latitude_longitude
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate

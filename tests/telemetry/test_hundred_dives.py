@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.estimator import Estimate
 from tests.telemetry.simulated_dives import Swum, estimated, ground_of, swum, telemetry_of
 

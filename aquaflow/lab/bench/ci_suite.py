@@ -14,8 +14,8 @@ import yaml
 
 from aquaflow.base.errors import InputError
 from aquaflow.lab.bench.scene import BenchmarkScene
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
-from aquaflow.lab.synthetic.dive import FORMAT_VERSION
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import FORMAT_VERSION, write_dive
 
 SMALL = {
     "frames": 24, "width": 160, "height": 120, "supersampling": 1, "camera_pitch_deg": 55.0,

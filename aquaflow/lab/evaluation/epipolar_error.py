@@ -132,7 +132,7 @@ def _moments(
             prepared = prepare(frame)
             camera = prepared.camera
             if calibration is None:  # what the dive found
-                camera = read.camera.scaled(camera.width, camera.height)
+                camera = read.camera.resize(camera.width, camera.height)
             yield _PosedKeypoints(
                 float(estimate.t_s[row]),
                 camera,

@@ -15,6 +15,7 @@ import numpy as np
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.medium import NAME as MEDIUM
+from aquaflow.geometry.arrays import sim3_to_json
 from aquaflow.lab.evaluation import metric_error as water
 from aquaflow.lab.evaluation.dive_files import EvaluatedDive, evaluated_dive
 from aquaflow.lab.evaluation.metric_error import MetricError, metric_error
@@ -72,9 +73,7 @@ class Evaluation:
             "path_length": error.path_length,
             "alignment": {
                 "kind": "sim3",
-                "scale": sim3.scale,
-                "rotation": sim3.R.tolist(),
-                "translation": sim3.t.tolist(),
+                **sim3_to_json(sim3),
                 "collinear": error.sim3.alignment.collinear,
             },
             "metric": self.metric.to_json() if self.metric else None,
@@ -84,15 +83,12 @@ class Evaluation:
         }
 
 
-def evaluate_dive(
-    dive: Path, truth: Path, tolerance_s: float = ASSOCIATION_TOLERANCE_S
-) -> Evaluation:
+def evaluate_dive(dive: Path, truth: Path) -> Evaluation:
     """Compare the dive's largest sub-map with ``truth``.
 
     Args:
         dive: the folder that a run wrote.
         truth: a TUM file, a CSV of picture positions, or a synthetic dive's folder.
-        tolerance_s: largest time difference between a pose and its truth.
 
     Raises:
         InputError: a file is missing or malformed, or too few poses have a truth.
@@ -103,7 +99,7 @@ def evaluate_dive(
     notes = _notes_on(estimate)
     estimated, true = estimate.trajectory, None
     if known.trajectory is not None:
-        estimated, true, path = _pair(estimate.trajectory, known.trajectory, tolerance_s, truth)
+        estimated, true, path = _pair(estimate.trajectory, known.trajectory, truth)
         error = trajectory_error(estimated, true, path)
     else:
         assert known.positions is not None
@@ -137,15 +133,16 @@ def _notes_on(dive: EvaluatedDive) -> list[str]:
 
 
 def _pair(
-    estimate: Trajectory, truth: Trajectory, tolerance_s: float, source: Path
+    estimate: Trajectory, truth: Trajectory, source: Path
 ) -> tuple[Trajectory, Trajectory, float]:
     """The poses of the same moments, and the length of the true path."""
-    ours, theirs = associate(estimate.t_s, truth.t_s, tolerance_s)
+    ours, theirs = associate(estimate.t_s, truth.t_s, ASSOCIATION_TOLERANCE_S)
     if len(ours) == 0:
         raise InputError(
-            f"no pose of {source} is within {tolerance_s:g} s of a pose of the dive: the truth "
-            f"covers {truth.t_s[0]:g} to {truth.t_s[-1]:g} s, the dive {estimate.t_s[0]:g} to "
-            f"{estimate.t_s[-1]:g} s; check the frame rate and the first frame's time"
+            f"no pose of {source} is within {ASSOCIATION_TOLERANCE_S:g} s of a pose of the dive: "
+            f"the truth covers {truth.t_s[0]:g} to {truth.t_s[-1]:g} s, the dive "
+            f"{estimate.t_s[0]:g} to {estimate.t_s[-1]:g} s; check the frame rate and the "
+            "first frame's time"
         )
     # The path between the first and the last common pose, with the truth's poses in between:
     # leaving them out would cut corners.

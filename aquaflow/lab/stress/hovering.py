@@ -18,7 +18,7 @@ from aquaflow.slam import Slam
 
 MINUTE, TWO_HOURS = 300, 72_000
 """Frames: of half a minute over two places, and of a dive whose drift would show."""
-SMALL = CAMERA.scaled(128, 96)
+SMALL = CAMERA.resize(128, 96)
 ERROR_M = 0.1
 """RMS distance from the truth, 1.6 m above the floor; a diverged dive is metres away."""
 HALF_GROWTH = 0.05

@@ -63,14 +63,12 @@ def _empty(check: Check, seed: int, grey: int) -> None:
     _blind(check, seed, lambda picture, i: np.full_like(picture, grey))
 
 
-def _hard(
-    check: Check, seed: int, change: Callable[[Picture, int], Picture], share: float = 0.9
-) -> None:
-    """Pictures that still show the place: ``share`` of the frames are placed, and placed right."""
+def _hard(check: Check, seed: int, change: Callable[[Picture, int], Picture]) -> None:
+    """Pictures that still show the place: seven tenths are placed, and placed right."""
     frames = spoil(clear_swim(seed), range(FRAMES), change)
     result = track(frames)
     sound(check, frames, result)
-    only_these_lost(check, result, (), share)
+    only_these_lost(check, result, (), share=0.7)
     on_path(check, result, path())
 
 
@@ -114,15 +112,13 @@ def salt_and_pepper(check: Check, seed: int) -> None:
         salted[hit] = np.where(rng.random((int(hit.sum()), 1)) < 0.5, 0, 255)
         return salted
 
-    _hard(check, seed, sprinkle, share=0.7)
+    _hard(check, seed, sprinkle)
 
 
 @case("images", "prior.flow.normalised_grey")
 def saturation(check: Check, seed: int) -> None:
     """Over-exposed: half the picture is at 255."""
-    _hard(
-        check, seed, lambda p, i: np.clip(p.astype(np.float64) * 2.0, 0, 255).astype(np.uint8), 0.7
-    )
+    _hard(check, seed, lambda p, i: np.clip(p.astype(np.float64) * 2.0, 0, 255).astype(np.uint8))
 
 
 @case("images", "prior.flow.normalised_grey")
@@ -135,20 +131,20 @@ def lamp_on_and_off(check: Check, seed: int) -> None:
         gain = 0.35 + 0.8 * middle * (i // 3 % 2)
         return np.asarray(np.clip(picture * gain[..., None], 0, 255), dtype=np.uint8)
 
-    _hard(check, seed, light, share=0.7)
+    _hard(check, seed, light)
 
 
 @case("images", "prior.flow.normalised_grey")
 def exposure_steps(check: Check, seed: int) -> None:
     """Exposure jumps by a factor of three from frame to frame."""
     gains = (0.5, 1.5, 0.8)
-    _hard(check, seed, lambda p, i: np.clip(p * gains[i % 3], 0, 255).astype(np.uint8), share=0.7)
+    _hard(check, seed, lambda p, i: np.clip(p * gains[i % 3], 0, 255).astype(np.uint8))
 
 
 @case("images", "tracking.current_keyframe.KeyframeTracker.classify")
 def snow(check: Check, seed: int) -> None:
     """Two seconds of marine snow over two fifths of the picture: it makes no keyframe."""
-    camera, poses, snowy = CAMERA.scaled(320, 240), path(34, step_m=0.015), range(8, 28)
+    camera, poses, snowy = CAMERA.resize(320, 240), path(34, step_m=0.015), range(8, 28)
     clear = film(Floor(seed), poses, camera)
     frames = spoil(clear, snowy, marine_snow(camera, 0.4, seed))
     result = track(frames)
@@ -180,7 +176,7 @@ def one_by_one(check: Check, seed: int) -> None:
 @case("images", "sources.preprocessing.Preparation")
 def width_8192(check: Check, seed: int) -> None:
     """Pictures 8192 pixels wide are made small, then tracked."""
-    large = CAMERA.scaled(8192, 6144)
+    large = CAMERA.resize(8192, 6144)
     floor, prepare = Floor(seed), Preparation(SourceConfig(width=CAMERA.width), large)
     frames = []
     for frame in film(floor, path(6)):

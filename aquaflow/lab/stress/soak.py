@@ -17,7 +17,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Frame
 
-TINY = CAMERA.scaled(64, 48)
+TINY = CAMERA.resize(64, 48)
 """A camera for thousands of frames."""
 SHORT, LONG = 200, 20_000
 """Frames or steps: of a quick case, and of one that would show what slowly grows."""

@@ -13,16 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.lab.training.compact_range import range_loss
-from aquaflow.lab.training.compact_recall import drawn_matches, mean_recall
-from aquaflow.lab.training.pair_generator.conditions import Conditions
-from aquaflow.lab.training.pair_generator.drawing import WindowVariation, training_pair
-from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
-from aquaflow.lab.training.pair_generator.noise import Draw
-from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
-from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE, Pool
-from aquaflow.lab.training.pairs import Correspondences, Pair, correspondences, join
-from aquaflow.prior.compact.network import (
+from aquaflow.lab.networks.compact.network import (
     COARSE,
     FINE,
     SHARPEST,
@@ -32,6 +23,15 @@ from aquaflow.prior.compact.network import (
     descriptors_at,
     window_products,
 )
+from aquaflow.lab.training.compact_range import range_loss
+from aquaflow.lab.training.compact_recall import drawn_matches, mean_recall
+from aquaflow.lab.training.pair_generator.conditions import Conditions
+from aquaflow.lab.training.pair_generator.drawing import WindowVariation, training_pair
+from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
+from aquaflow.lab.training.pair_generator.noise import Draw
+from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
+from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE, Pool
+from aquaflow.lab.training.pairs import Correspondences, Pair, correspondences, join
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from aquaflow.lab.networks.compact.network import COARSE, Compared, Encoded, cell_rays
 from aquaflow.lab.training.pairs import Pair, ViewBatch
-from aquaflow.prior.compact.network import COARSE, Compared, Encoded, cell_rays
 
 LN_2 = 0.6931
 LOG_SPREADS = (-4.0, 2.0)

@@ -9,12 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aquaflow.lab.training.compact_range import Compare, range_error
-from aquaflow.lab.training.pair_generator.noise import Draw
-from aquaflow.lab.training.pairs import Correspondences, Pair, correspondences
-from aquaflow.prior import flow as dense
-from aquaflow.prior.compact.export import INPUTS
-from aquaflow.prior.compact.network import (
+from aquaflow.lab.networks.compact.export import INPUTS
+from aquaflow.lab.networks.compact.network import (
     FINE,
     Compared,
     Encoded,
@@ -23,6 +19,10 @@ from aquaflow.prior.compact.network import (
     descriptors_at,
     fine_around,
 )
+from aquaflow.lab.training.compact_range import Compare, range_error
+from aquaflow.lab.training.pair_generator.noise import Draw
+from aquaflow.lab.training.pairs import Correspondences, Pair, correspondences
+from aquaflow.prior import flow as dense
 from aquaflow.prior.flow import sample
 from aquaflow.prior.hybrid import coarse_flow
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from aquaflow.base.errors import InputError
+from aquaflow.lab.networks.compact.export import export
+from aquaflow.lab.networks.compact.network import CompactPrior
 from aquaflow.lab.training.compact import CompactSettings, CompactTask
 from aquaflow.lab.training.compact_range import (
     calibration_figures,
@@ -40,8 +42,6 @@ from aquaflow.lab.training.trainer import (
     has_ended,
     train,
 )
-from aquaflow.prior.compact.export import export
-from aquaflow.prior.compact.network import CompactPrior
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, write_card
 from aquaflow.prior.runtime import INT8_ENCODER
 
@@ -234,10 +234,8 @@ def with_figures(folder: Path, card: PriorCard, sets: dict[str, list[Pair]]) -> 
     return card
 
 
-def figures_of(
-    folder: Path, card: PriorCard, pairs: list[Pair], ranged: bool = True
-) -> dict[str, Any]:
-    """Recall in 32 and 8 bits and, where the pairs are ``ranged``, how honest the variance is."""
+def figures_of(folder: Path, card: PriorCard, pairs: list[Pair]) -> dict[str, Any]:
+    """Recall in 32 and 8 bits, and how honest the variance is."""
     compare = onnx_comparison(folder / DECODER)
     figures: dict[str, Any] = {
         "pairs": sum(len(pair.a.K) for pair in pairs),
@@ -246,10 +244,7 @@ def figures_of(
     for bits, file in ENCODERS.items():
         encode = onnx_encoder(folder / file)
         found = mean_recall(encode, compare, pairs) | tracked_recall(encode, pairs)
-        if ranged:
-            errors = normalised_errors(encode, compare, pairs)
-            found |= calibration_figures(errors / card.range_variance_factor**0.5)
-        else:
-            del found["log_range"]
+        errors = normalised_errors(encode, compare, pairs)
+        found |= calibration_figures(errors / card.range_variance_factor**0.5)
         figures[bits] = {name: round(value, 4) for name, value in found.items()}
     return figures

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.lab.networks.mast3r.network import Mast3r, ViewGeometry
 from aquaflow.lab.training.datasets.chaining import chain
 from aquaflow.lab.training.datasets.colmap import colmap
 from aquaflow.lab.training.datasets.posed import Frames, Posed, nothing_in, read_image
@@ -27,7 +28,6 @@ from aquaflow.lab.training.datasets.uwstereo import uwstereo
 from aquaflow.lab.training.losses import Losses, LossWeights, pair_loss
 from aquaflow.lab.training.mining import MinedPairs, load_index, mine, save_index
 from aquaflow.lab.training.trainer import Progress, Schedule, TrainingPlan, TrainingProcess, train
-from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
 
 # --------------------------------------------------------------------------------------------------
 # FLSea-stereo (Randall and Treibitz, 2023): real dives with depth from photogrammetry.
@@ -77,7 +77,7 @@ def _frame(image: Path, depth: Path, camera: CameraModel) -> Posed:
     if metres is None or metres.shape != picture.shape[:2]:
         raise InputError(f"{depth} does not fit its picture; unpack the data set again")
     height, width = picture.shape[:2]
-    sized = camera.scaled(width, height)
+    sized = camera.resize(width, height)
     depth_m = np.nan_to_num(np.asarray(metres, dtype=np.float32), posinf=0.0, neginf=0.0)
     if sized.is_distorted:
         maps = _undistorting(sized)

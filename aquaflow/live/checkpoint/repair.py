@@ -48,12 +48,7 @@ class RepairedDive:
     """A sentence for each loss that the checkpoint's own files and the rows show."""
 
 
-def repair_dive(
-    checkpoint: Checkpoint,
-    dive: Path,
-    name_of: Callable[[int], str],
-    now: ClockReading | None = None,
-) -> RepairedDive:
+def repair_dive(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) -> RepairedDive:
     """Prepare ``dive`` for resuming from ``checkpoint``; ``name_of`` gives a frame index's name.
 
     Raises:
@@ -73,7 +68,7 @@ def repair_dive(
     for path in sorted((dive / WORK).glob(f"*/*{SUFFIX}")):
         _look_at(path, checkpoint.keyframes if older else None, aside)
     known = checkpoint.frames
-    cut_at_checkpoint(dive, checkpoint.moment, now or ClockReading.now(), aside)
+    cut_at_checkpoint(dive, checkpoint.moment, ClockReading.now(), aside)
     after = [or_lost(row, known) for row in rows.rows]
     return RepairedDive(after, losses + _row_losses(rows, dive / MARKER))
 

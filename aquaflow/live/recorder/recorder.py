@@ -27,7 +27,7 @@ from aquaflow.live.recorder.writing import (
     QueuedSample,
     WriteQueue,
 )
-from aquaflow.recordings.dive_file import require_mcap
+from aquaflow.recordings.mcap_messages import require_mcap
 from aquaflow.types import Dropped, Frame, TelemetrySample
 
 # --------------------------------------------------------------------------------------------------

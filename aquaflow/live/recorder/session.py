@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.base.errors import AquaFlowError
+from aquaflow.live.clock_reading import WallClock
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.recordings.playback import Event, Playback, arrival_of, delay_event
 from aquaflow.sources import CameraSource, RawTap, TelemetrySource
-from aquaflow.sources.wall_clock import WallClock
 from aquaflow.types import Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)

@@ -17,9 +17,9 @@ from aquaflow import __version__
 from aquaflow.base.clocks.wall import WallClockWatch
 from aquaflow.config.service import RecordingConfig
 from aquaflow.config.stage import MountingConfig
+from aquaflow.live.recorder.dive_file import DiveFile
 from aquaflow.live.recorder.status import RecorderStatus
-from aquaflow.recordings.dive_file import DiveFile
-from aquaflow.recordings.telemetry_json import sample_to_json
+from aquaflow.recordings.telemetry_lines import sample_to_json
 from aquaflow.types import KIND_OF, CameraModel, Dropped, EncodedPicture, Frame, TelemetrySample
 
 FORMAT = "1"

@@ -23,7 +23,7 @@ from aquaflow.survey.change.comparison import (
 from aquaflow.survey.change.patches import NAMES, Patch
 from aquaflow.survey.change.surface import Surface
 from aquaflow.survey.export.ortho.geotiff import writing_raster
-from aquaflow.survey.export.ortho.grid import NODATA, Grid, GridTile, RasterFile
+from aquaflow.survey.export.ortho.grid import NODATA, Grid, RasterFile
 from aquaflow.survey.export.ortho.ground import Ground
 
 Array = npt.NDArray[np.float64]
@@ -162,11 +162,4 @@ def write_change_raster(
     bands = bands_of(compared, grid)
     with writing_raster(folder, CHANGE, grid, ground, tags) as raster:
         for tile in grid.tiles():
-            raster.write(tile, bands[(slice(None), *_part(tile))])
-
-
-def _part(tile: GridTile) -> tuple[slice, slice]:
-    return (
-        slice(tile.row, tile.row + tile.height),
-        slice(tile.column, tile.column + tile.width),
-    )
+            raster.write(tile, bands[(slice(None), *tile.part)])

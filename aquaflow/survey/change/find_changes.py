@@ -18,6 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import explain_refusal
 from aquaflow.base.storage.table import csv_text
 from aquaflow.dive.dive import Dive
+from aquaflow.geometry.arrays import sim3_to_json
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.change_picture import change_png, write_change_raster
 from aquaflow.survey.change.comparison import NOT_SEEN, UNCHANGED, SurfaceComparison, compare
@@ -82,8 +83,7 @@ class Changes:
             "sigmas_widened_by": compared.null[1],
             "registration": {
                 "shared": moved.shared, "residual_sigma": moved.spread,
-                "scale": float(moved.T.scale), "rotation": moved.T.R.tolist(),
-                "translation": moved.T.t.tolist(),
+                **sim3_to_json(moved.T),
                 "sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
             },
             "light_ratio": list(compared.colours.gains),

@@ -6,18 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import to_geodetic
+from aquaflow.geometry.arrays import sim3_from_json
 from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive, read_site
 from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of
 from aquaflow.telemetry.world_frame import WorldFrame
-
-ROTATION_TOLERANCE = 1e-6
-"""Largest difference of R^T R from the identity, as in metric.json."""
 
 
 def T_site_dive(site: Path, dive: SiteDive) -> PlacedSubMap:
@@ -88,16 +86,9 @@ def read_transform(path: Path) -> Sim3:
         InputError: the file cannot be read, or holds none.
     """
     try:
-        data = read_regular_json(path)
-        R, t = (np.asarray(data[key], np.float64) for key in ("rotation", "translation"))
-        T = Sim3(R, t, float(data.get("scale", 1.0)))
-        if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite() or T.scale <= 0.0:
-            raise DamagedError("it is no similarity")
-        if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
-            raise DamagedError("its rotation is none")
+        return sim3_from_json({"scale": 1.0, **read_regular_json(path)})
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"cannot read the transform {path}: {reason_of(error)}; give JSON with scale, "
             "rotation (3 x 3) and translation"
         ) from error
-    return T

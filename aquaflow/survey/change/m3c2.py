@@ -87,10 +87,10 @@ class SurfaceDistances:
         """[N] True where both clouds have a surface."""
         return np.isfinite(self.distance)
 
-    def level(self, confidence: float = CONFIDENCE) -> Array:
+    def level(self) -> Array:
         """[N] level of detection: what |distance| stays below with this probability where nothing
         changed."""
-        return np.asarray(student.ppf(0.5 + 0.5 * confidence, self.freedom) * self.sigma)
+        return np.asarray(student.ppf(0.5 + 0.5 * CONFIDENCE, self.freedom) * self.sigma)
 
 
 def normals_at(

@@ -11,8 +11,11 @@ from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive.deliverables import Deliverable
 from aquaflow.dive.dive import Dive
 from aquaflow.slam import Slam
-from aquaflow.survey.coverage import CoverageClass, DiveCoverage, PageView, mapping_range
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.coverage_file import NAME, write_coverage_file
+from aquaflow.survey.coverage.dive_coverage import DiveCoverage
+from aquaflow.survey.coverage.footprint import mapping_range
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.picture import coverage_png
 
 NUMBERS, PICTURE = "coverage.json", "coverage.png"

@@ -21,11 +21,12 @@ import numpy.typing as npt
 
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config.service import CoverageConfig
-from aquaflow.dive.from_maps import attenuations
 from aquaflow.dive.views import CoverageView, RunningDive
 from aquaflow.mapping.work import OwnedMaps
-from aquaflow.survey.coverage import DiveCoverage, PageView, mapping_range
 from aquaflow.survey.coverage.coverage_files import CoverageFiles
+from aquaflow.survey.coverage.dive_coverage import DiveCoverage
+from aquaflow.survey.coverage.footprint import mapping_range
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.picture import cells_affine, cells_png, coverage_png
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
@@ -201,6 +202,10 @@ class LiveCoverage(CoverageView):
         self._water_s, config = now, dive.dive_run.config.coverage
 
         def read(maps: OwnedMaps, _: object) -> None:
+            if not maps.mappers:
+                return
+            from aquaflow.dive.map_file import attenuations  # loads torch
+
             for number, attenuation in attenuations(maps.mappers).items():
                 self._limits[number] = mapping_range(attenuation, config.least_contrast)
 

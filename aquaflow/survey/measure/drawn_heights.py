@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from aquaflow.base.errors import InputError
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
-from aquaflow.survey.export.ortho.grid import Grid, GridTile
+from aquaflow.survey.export.ortho.grid import Grid
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.survey.measure.height_field import Array, Counts, HeightField, Held
@@ -167,7 +167,7 @@ def _over(
     """[h, w] two numbers of each cell that has a height, tile by tile; NaN and 0 elsewhere."""
     values, counts = np.full(height.shape, np.nan), np.zeros(height.shape, np.int32)
     for tile in grid.tiles():
-        part = _part(tile)
+        part = tile.part
         known = np.isfinite(height[part])
         if known.any():
             points = np.dstack([grid.centres(tile), height[part]])[known]
@@ -209,10 +209,3 @@ def _held_heights(
         counts(filled), counts(filled, PICTURE_SIGMA_PX), counts(filled, -PICTURE_SIGMA_PX),
         counts(raised),
     )  # fmt: skip
-
-
-def _part(tile: GridTile) -> tuple[slice, slice]:
-    return (
-        slice(tile.row, tile.row + tile.height),
-        slice(tile.column, tile.column + tile.width),
-    )

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.dive.medium import Rgb
-from aquaflow.survey.coverage import PageView
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.telemetry.world_frame import SourceReport
 
 FocalSource = Literal["calibrated", "guessed", "refined"]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.coverage import COLOURS, WORDS, CoverageClass, PageView
+from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.picture import cells_affine
 from aquaflow.survey.report.data import DepthProfile, MediumCurves, PathPlot
 

@@ -16,12 +16,12 @@ from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.dive.medium import Rgb
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.survey.coverage import PageView
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.reef_numbers import JSON as REEF
-from aquaflow.survey.report import (
+from aquaflow.survey.report.data import (
     CameraSummary,
     DepthProfile,
     HeldOutExample,

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.coverage import WORDS, CoverageClass, PageView, visibility
+from aquaflow.survey.coverage.classes import WORDS, CoverageClass
+from aquaflow.survey.coverage.footprint import visibility
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.report.data import (
     CameraSummary,
     DepthProfile,

@@ -15,6 +15,7 @@ from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.archive import read_array_file
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive.dive import Dive
+from aquaflow.geometry.arrays import sim3_from_json, sim3_to_json
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive
 
@@ -127,7 +128,7 @@ def write_merged(site: Path, merged: MergedSite) -> None:
     with atomic_write(site / ARRAYS) as stream:
         np.lib.format.write_array(stream, merged.keyframes, allow_pickle=False)
     sub_maps = [
-        asdict(each) | {"T_sm": _of_sim3(each.T_sm), "T_sn": _of_sim3(each.T_sn)}
+        asdict(each) | {"T_sm": sim3_to_json(each.T_sm), "T_sn": sim3_to_json(each.T_sn)}
         for each in merged.sub_maps
     ]
     write_json(
@@ -189,8 +190,9 @@ def _merge(
 ) -> MergedSite:
     sub_maps = tuple(
         PlacedSubMap(
-            str(each["dive"]), int(each["number"]), int(each["component"]), _to_sim3(each["T_sm"]),
-            _to_sim3(each["T_sn"]), int(each["keyframes"]), float(each["bent"]),
+            str(each["dive"]), int(each["number"]), int(each["component"]),
+            sim3_from_json(each["T_sm"]), sim3_from_json(each["T_sn"]),
+            int(each["keyframes"]), float(each["bent"]),
         )
         for each in data["sub_maps"]
     )  # fmt: skip
@@ -198,15 +200,3 @@ def _merge(
         dict(data["dives"]), dict(data["left_out"]), tuple(data["components"]), sub_maps,
         tuple(data["links"]), keyframes,
     )  # fmt: skip
-
-
-def _of_sim3(T: Sim3) -> dict[str, Any]:
-    return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
-
-
-def _to_sim3(stated: dict[str, Any]) -> Sim3:
-    R, t = np.array(stated["rotation"], np.float64), np.array(stated["translation"], np.float64)
-    T = Sim3(R, t, float(stated["scale"]))
-    if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite():
-        raise DamagedError("a transform is not finite")
-    return T

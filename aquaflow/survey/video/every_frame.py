@@ -176,7 +176,7 @@ class _Light:
         share = (frame.index - one.frame_index) / span if span else 0.0
         height, width = frame.image.shape[:2]
         view = View(
-            frame.index, frame.image, one.camera.scaled(width, height), T_wc, one.keyframe, False,
+            frame.index, frame.image, one.camera.resize(width, height), T_wc, one.keyframe, False,
             frame.mask, one.device,
         )  # fmt: skip
         view.log_gain = (1.0 - share) * one.log_gain + share * two.log_gain

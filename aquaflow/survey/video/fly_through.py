@@ -70,7 +70,7 @@ def resize(camera: CameraModel, width: int | None) -> CameraModel:
     """The camera for pictures ``width`` px wide, of the same shape; None: as it is."""
     if width is None:
         return camera
-    return camera.scaled(width, round(camera.height * width / camera.width))
+    return camera.resize(width, round(camera.height * width / camera.width))
 
 
 class Through:

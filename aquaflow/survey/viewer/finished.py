@@ -160,7 +160,7 @@ def open_dive(
     tools = Tools(others=PinnedNotes(folder).tools())
     page: list[ViewerPage] = []
 
-    def opened() -> FinishedDive:
+    def read() -> FinishedDive:
         dive = Dive(folder)
         if white_balance is not None:
             from aquaflow.dive.white_balance import show_in  # loads torch
@@ -171,12 +171,12 @@ def open_dive(
     def scale(given: Asked) -> Asked:
         said = mark_coverage(given, mark) if mark is not None else {}
         if said.get("rescaled"):
-            fill(page[0], opened())
+            fill(page[0], read())
         return said
 
     if mark is not None:
         tools.others[SCALE] = scale
-    dive = opened()
+    dive = read()
     page.append(show_dive(dive, config, tools))
     prepare(folder, dive.key, dive.packed, dive.map, page[0])
     return page[0]

@@ -73,7 +73,7 @@ class Reshaped:
         """True of a frame whose pose was solved against the old depths."""
         return tracked.keyframe == self.keyframe and tracked.frame.index < self.first_after
 
-    def carried(self, T_kf: Sim3) -> Sim3:
+    def correct(self, T_kf: Sim3) -> Sim3:
         """The pose in the keyframe, against the new depths."""
         return T_kf @ Sim3.exp(np.append(-self.change @ T_kf.t, 0.0))
 

@@ -32,7 +32,7 @@ TILT, YAW, STRETCH = np.radians(0.5), np.radians(-3.0), 1.02
 def wrong(tilt: float = TILT, yaw: float = YAW, scale: float = STRETCH) -> Trajectory:
     """The truth turned about its vertical, then tilted about north, and stretched."""
     turn = Rotation.from_euler("x", tilt) * Rotation.from_euler("z", yaw)
-    return TRUTH.transformed(Sim3(turn.as_matrix(), np.array([3.0, -2.0, 1.0]), scale))
+    return TRUTH.transform(Sim3(turn.as_matrix(), np.array([3.0, -2.0, 1.0]), scale))
 
 
 def found(frame: WorldFrame, estimate: Trajectory) -> MetricError:

@@ -80,7 +80,7 @@ def test_transforming_moves_positions_and_turns_cameras(tmp_path):
     path.write_text(POSE)
     turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
 
-    moved = read_tum(path).transformed(Sim3(turn, np.array([0.0, 0.0, 1.0]), 2.0))
+    moved = read_tum(path).transform(Sim3(turn, np.array([0.0, 0.0, 1.0]), 2.0))
 
     np.testing.assert_allclose(moved.positions[0], [-4.0, 2.0, 7.0], atol=1e-12)
     np.testing.assert_allclose(moved.R_wc[0], turn, atol=1e-12)

@@ -37,7 +37,7 @@ def similarity(seed: int, scale: float) -> Sim3:
 def test_moved_and_scaled_truth_has_no_error_but_in_scale(seed, scale):
     truth = walk(seed)
 
-    error = trajectory_error(truth.transformed(similarity(seed, scale)), truth, truth.path_length)
+    error = trajectory_error(truth.transform(similarity(seed, scale)), truth, truth.path_length)
 
     assert error.sim3.rmse < 1e-6
     assert error.relative.translation_rmse < 1e-6
@@ -53,7 +53,7 @@ def test_errors_do_not_depend_on_the_map_s_frame_or_scale(seed, scale):
     estimate = noisy(truth, seed + 1)
 
     here = trajectory_error(estimate, truth, truth.path_length)
-    moved = estimate.transformed(similarity(seed, scale))
+    moved = estimate.transform(similarity(seed, scale))
     there = trajectory_error(moved, truth, truth.path_length)
 
     assert there.sim3.rmse == pytest.approx(here.sim3.rmse, rel=1e-6)
@@ -72,7 +72,7 @@ def test_similarity_alignment_is_never_worse_than_rigid():
 
 def test_wrong_scale_shows_in_the_rigid_error_only():
     truth = walk(4)
-    doubled = truth.transformed(Sim3(np.eye(3), np.zeros(3), 2.0))
+    doubled = truth.transform(Sim3(np.eye(3), np.zeros(3), 2.0))
 
     error = trajectory_error(doubled, truth, truth.path_length)
 
@@ -130,7 +130,7 @@ def downward_survey(seed: int) -> Trajectory:
 def test_heights_of_a_survey_are_no_horizontal_error(seed, scale):
     survey = downward_survey(seed)
 
-    moved = survey.transformed(similarity(seed, scale))
+    moved = survey.transform(similarity(seed, scale))
 
     assert horizontal_error(moved, survey.positions[:, :2]) < 1e-6
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.mounting import mountings_of
 from aquaflow.lab.synthetic.path import plan_path

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.lab.synthetic import SyntheticConfig, Truth, objects, read_truth, write_dive
+from aquaflow.lab.synthetic import objects
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
+from aquaflow.lab.synthetic.truth import Truth, read_truth
 
 BARE = {"supersampling": 1, "snow_per_m3": 0.0, "noise_sigma": 0.0, "width": 64, "height": 48}
 

@@ -18,10 +18,12 @@ from scipy.spatial.transform import Rotation
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.optics import rays_of_pixels
 from aquaflow.geometry.port import FlatPort
-from aquaflow.lab.synthetic import SyntheticConfig, Truth, read_telemetry, read_truth, write_dive
-from aquaflow.lab.synthetic.dive import build
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import build, write_dive
 from aquaflow.lab.synthetic.path import Path as Way
 from aquaflow.lab.synthetic.render import SyntheticScene
+from aquaflow.lab.synthetic.telemetry import read_telemetry
+from aquaflow.lab.synthetic.truth import Truth, read_truth
 from aquaflow.lab.synthetic.water import WATER_TYPES
 
 SMALL = SyntheticConfig(frames=10, width=160, height=120)

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import quad
 
-from aquaflow.lab.synthetic import SyntheticConfig, read_truth, write_dive
-from aquaflow.lab.synthetic.config import Lamps
+from aquaflow.lab.synthetic.config import Lamps, SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.lab.synthetic.lamps import BACKWARD_PER_SR, NEAREST_M, SCATTERED_SHARE, LampLight
+from aquaflow.lab.synthetic.truth import read_truth
 from aquaflow.lab.synthetic.water import WATER_TYPES, Medium
 
 AT_CAMERA = Lamps(ambient=0.0, even_m=1.0, places_m=((0.0, 0.0, 0.0),), half_angle_deg=60.0)

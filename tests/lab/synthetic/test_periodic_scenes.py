@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from aquaflow.lab.synthetic import SyntheticConfig, Truth, read_truth, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.lab.synthetic.hull import PLATE_M, RADIUS_M, painted_plates, plated_side
 from aquaflow.lab.synthetic.relief import Area
+from aquaflow.lab.synthetic.truth import Truth, read_truth
 
 TINY = {"width": 120, "height": 90, "supersampling": 1, "frames": 3}
 AREA = Area(-1.0, -2.0, 0.01, (400, 320))

@@ -11,16 +11,12 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from aquaflow.lab.synthetic import (
-    SimulatedDive,
-    SyntheticConfig,
-    read_telemetry,
-    read_truth,
-    simulate,
-    write_dive,
-)
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import SimulatedDive, simulate, write_dive
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
+from aquaflow.lab.synthetic.telemetry import read_telemetry
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
+from aquaflow.lab.synthetic.truth import read_truth
 from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.types import Altitude, AngularRate, Attitude, Depth, Velocity
 from tests.lab.synthetic.without_errors import WITHOUT_ERRORS

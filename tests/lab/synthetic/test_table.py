@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.synthetic import SyntheticConfig, read_telemetry, simulate
-from aquaflow.lab.synthetic.telemetry import HEADER, write_telemetry
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import simulate
+from aquaflow.lab.synthetic.telemetry import HEADER, read_telemetry, write_telemetry
 from aquaflow.types import (
     AngularRate,
     Attitude,

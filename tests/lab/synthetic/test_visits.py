@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.dive import build, write_dive
 from aquaflow.lab.synthetic.site import SurveySite, site_of
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.lab.synthetic import SyntheticConfig, Truth, read_truth, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
+from aquaflow.lab.synthetic.truth import Truth, read_truth
 
 TINY = {"width": 96, "height": 72, "supersampling": 1}
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from aquaflow.lab.networks.compact.network import COARSE, Compared, Encoded
 from aquaflow.lab.training.compact import covered_trust
 from aquaflow.lab.training.compact_range import (
     calibration_figures,
@@ -18,7 +19,6 @@ from aquaflow.lab.training.compact_range import (
 )
 from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pairs import Pair, ViewBatch
-from aquaflow.prior.compact.network import COARSE, Compared, Encoded
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from aquaflow import cli
+from aquaflow.lab.networks.compact.network import CompactPrior, Encoded, NetworkSize
 from aquaflow.lab.training import compact, compact_run, held_out
 from aquaflow.lab.training import compact_run as compact_figures
 from aquaflow.lab.training.compact import CompactSettings
@@ -32,8 +33,7 @@ from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.stored_pairs import Pool
 from aquaflow.lab.training.pairs import overlap
-from aquaflow.prior.compact import network as compact_network
-from aquaflow.prior.compact.network import CompactPrior, Encoded, NetworkSize
+from aquaflow.prior.factory import SHIPPED
 from aquaflow.prior.folder import read_card
 from tests.lab.training.small_maps import small_dive
 
@@ -128,7 +128,7 @@ def test_a_variance_is_widened_where_errors_are_larger_and_never_narrowed(
     monkeypatch.setattr(compact_figures, "onnx_encoder", lambda path: None)
     monkeypatch.setattr(compact_figures, "onnx_comparison", lambda path: None)
     monkeypatch.setattr(compact_figures, "normalised_errors", lambda *inputs: errors)
-    shipped = Path(compact_network.__file__).parents[1] / "weights" / "compact"
+    shipped = SHIPPED
     folder = Path(shutil.copytree(shipped, tmp_path / "prior"))
     card = with_honest_range(folder, read_card(folder), [])
     assert card.range_variance_factor == pytest.approx(factor)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from aquaflow.base.errors import InputError
+from aquaflow.lab.networks.compact.network import COARSE, CompactPrior, NetworkSize
 from aquaflow.lab.training import compact
 from aquaflow.lab.training.compact import CompactSettings, CompactTask, coarse_loss, compact_losses
 from aquaflow.lab.training.compact_recall import mean_recall
@@ -36,7 +37,6 @@ from aquaflow.lab.training.trainer import (
     has_ended,
     train,
 )
-from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
 from tests.lab.training.small_maps import small_dive
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 
 from aquaflow import cli
 from aquaflow.base.errors import InputError
+from aquaflow.lab.networks.mast3r import export as weights
+from aquaflow.lab.networks.mast3r.network import TINY, Mast3r
 from aquaflow.lab.training import finetune
 from aquaflow.lab.training import trainer as processes
 from aquaflow.lab.training.finetune import (
@@ -25,8 +27,6 @@ from aquaflow.lab.training.finetune import (
 )
 from aquaflow.lab.training.mining import MinedPairs
 from aquaflow.lab.training.trainer import DistributedProcess, TrainingProcess
-from aquaflow.prior.mast3r import export as weights
-from aquaflow.prior.mast3r.network import TINY, Mast3r
 from tests.lab.training.data_trees import write_colmap, write_tartanair
 from tests.small_recording import GIVE_UP_S
 
@@ -152,8 +152,8 @@ WORKER = """
 import sys
 from pathlib import Path
 import torch
-from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.network import TINY
+from aquaflow.lab.networks.mast3r.network import Mast3r
+from aquaflow.lab.networks.mast3r.network import TINY
 from aquaflow.lab.training import finetune
 from aquaflow.lab.training.trainer import joined_processes
 from aquaflow.lab.training.trainer import Schedule

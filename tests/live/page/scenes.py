@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from aquaflow.survey.coverage import PageView
 from aquaflow.survey.coverage.live_coverage import describe
+from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.picture import cells_png, coverage_png
 from aquaflow.web import HttpRequest, HttpResponse
 from tests.live.health.reports import REPORT

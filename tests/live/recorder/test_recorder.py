@@ -17,11 +17,11 @@ from aquaflow.config.service import RecordingConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.port import FlatPort
-from aquaflow.live.recorder import Recorder, RecorderStatus
+from aquaflow.live.recorder import Recorder, RecorderStatus, dive_file
+from aquaflow.live.recorder.dive_file import DiveFile
 from aquaflow.live.recorder.session import RecordingSession
 from aquaflow.live.recorder.writing import encode
-from aquaflow.recordings import dive_file
-from aquaflow.recordings.dive_file import DiveFile
+from aquaflow.recordings import mcap_messages
 from aquaflow.recordings.mcap_camera import McapCamera
 from aquaflow.recordings.mcap_messages import McapMessages, mcap_files
 from aquaflow.recordings.mcap_telemetry import McapTelemetry
@@ -322,6 +322,6 @@ def test_a_recording_is_never_written_over(tmp_path: Path) -> None:
 
 
 def test_a_missing_extra_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dive_file, "find_spec", lambda name: None)
+    monkeypatch.setattr(mcap_messages, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'aquaflow\[recording\]'"):
         Recorder(tmp_path, LOSSLESS)

@@ -18,7 +18,7 @@ from aquaflow.config import FusionConfig
 from aquaflow.config.service import PoseConfig
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.estimator import estimate

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from aquaflow.config.service import CoverageConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.survey.coverage import PageView, page_view
 from aquaflow.survey.coverage.footprint import BLOCKS, Footprint
+from aquaflow.survey.coverage.page_view import PageView, page_view
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
 from aquaflow.telemetry.world_frame import WorldFrame
 

@@ -12,7 +12,8 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.service import CoverageConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.survey.coverage import DiveCoverage, dive_coverage
+from aquaflow.survey.coverage import dive_coverage
+from aquaflow.survey.coverage.dive_coverage import DiveCoverage
 from aquaflow.survey.coverage.footprint import BLOCKS, Footprint
 from tests.survey.coverage.surveys import ALTITUDE, CAMERA, above, metric
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from aquaflow.config.service import CoverageConfig
-from aquaflow.survey.coverage import page_view
 from aquaflow.survey.coverage.classes import CoverageClass
-from aquaflow.survey.coverage.page_view import PageView
+from aquaflow.survey.coverage.page_view import PageView, page_view
 from aquaflow.survey.coverage.survey_lines import MOST_POINTS, LineState, line_state, survey_lines
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.coverage.surveys import HEIGHT, WIDTH, lawnmower, metric, surveyed

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.survey.coverage import mapping_range, visibility
 from aquaflow.survey.coverage.classes import near_bins
+from aquaflow.survey.coverage.footprint import mapping_range, visibility
 from aquaflow.survey.coverage.raster import RANGE_BINS, GridFrame
 
 

@@ -14,8 +14,9 @@ from PIL import Image
 
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.survey.coverage import CoverageClass
-from aquaflow.survey.report import (
+from aquaflow.survey.coverage.classes import CoverageClass
+from aquaflow.survey.report import sections as survey_sections
+from aquaflow.survey.report.data import (
     CameraSummary,
     DepthProfile,
     HeldOutExample,
@@ -24,9 +25,8 @@ from aquaflow.survey.report import (
     MediumCurves,
     PathPlot,
     ReportData,
-    render_report,
 )
-from aquaflow.survey.report import sections as survey_sections
+from aquaflow.survey.report.page import render_report
 from aquaflow.survey.report.pdf import write_pdf
 from aquaflow.survey.report.report_of import MOST_REASONS, left_out, profile
 from aquaflow.telemetry.world_frame import WorldFrame

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.survey.report import CameraSummary, HeldOutExample, ReportData, render_report
+from aquaflow.survey.report.data import CameraSummary, HeldOutExample, ReportData
+from aquaflow.survey.report.page import render_report
 from tests.browser import Browser, needs_browser
 
 pytestmark = [pytest.mark.ci, needs_browser]

@@ -11,7 +11,8 @@ from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
 from aquaflow.dive.tum import read_tum
 from aquaflow.geometry.alignment import align
-from aquaflow.lab.synthetic import SyntheticConfig, write_dive
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.dive import write_dive
 from aquaflow.sources import open_recording
 from aquaflow.survey.site.merged_file import MergedSite
 from aquaflow.survey.site.merging import add_to_site, merge

@@ -252,7 +252,7 @@ def test_each_pose_of_a_site_says_its_dive_and_has_its_lens(
 ) -> None:
     lens = CameraModel(64, 48, 64.0, 64.0, 32.0, 24.0)
     began = datetime(2026, 11, 24, 12, 0, 0, tzinfo=timezone.utc)
-    parts = [PathPart("monday", 0, None, lens), PathPart("tuesday", 2, began, lens.scaled(32, 24))]
+    parts = [PathPart("monday", 0, None, lens), PathPart("tuesday", 2, began, lens.resize(32, 24))]
     poses = np.array([[x, 0, 0, 1, 0, 0, 0, 1] for x in (0.0, 1.0, 9.0, 9.5)], np.float32)
     seen = page._exhibit.path
     try:

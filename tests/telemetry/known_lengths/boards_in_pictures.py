@@ -82,7 +82,7 @@ def photographed(boards: list[tuple[Printed, Sim3]], T_nc: Sim3, seed: int = 0) 
     rng = np.random.default_rng(seed)
     w, h = CAMERA.width * FINER, CAMERA.height * FINER
     floor = cv2.resize(rng.uniform(60, 150, (60, 80)).astype(np.float32), (w, h))
-    camera = CAMERA.scaled(w, h)
+    camera = CAMERA.resize(w, h)
     for board, T_nb in boards:
         seen = camera.project(T_nc.inverse().apply(T_nb.apply(board.corners())))
         size = board.drawing.shape

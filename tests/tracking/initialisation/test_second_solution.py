@@ -113,7 +113,7 @@ def test_the_direction_of_motion_and_the_shape_of_depths_come_out_right() -> Non
     for view, matched in enumerate(start.matched, start=1):
         wrong = matched.estimate.T.inverse()
         assert start.off(wrong, view) > 0.01
-        assert start.off(found.carried(wrong), view) < 0.4 * start.off(wrong, view)
+        assert start.off(found.correct(wrong), view) < 0.4 * start.off(wrong, view)
 
 
 def test_the_keyframe_keeps_its_unit() -> None:
@@ -133,7 +133,7 @@ def test_a_pose_at_the_keyframe_itself_stays() -> None:
         second.take(matched)
     found = second.solve(len(ALONG))
     assert found is not None
-    np.testing.assert_array_equal(found.carried(Sim3.identity()).matrix, np.eye(4))
+    np.testing.assert_array_equal(found.correct(Sim3.identity()).matrix, np.eye(4))
 
 
 def test_across_a_straight_way_nothing_is_changed() -> None:
@@ -144,7 +144,7 @@ def test_across_a_straight_way_nothing_is_changed() -> None:
     found = second.solve(9)
     assert found is not None
     aside = Sim3(np.eye(3), TILT.T @ np.array([0.0, 0.3, 0.0]))
-    assert np.linalg.norm((found.carried(aside).inverse() @ aside).log()) < 1e-3
+    assert np.linalg.norm((found.correct(aside).inverse() @ aside).log()) < 1e-3
 
 
 @pytest.mark.parametrize("count", [0, 2])

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
-from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.estimator import Estimate
 from aquaflow.tracking.metric.measured import NEAR_S, Corrections, WorldEdge, world_edges
 from tests.telemetry.simulated_dives import Swum, estimated, part_of, swum

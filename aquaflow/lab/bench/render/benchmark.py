@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.meter import require
 from aquaflow.lab.bench.render.contenders import (
-    BenchmarkedRenderer,
     Timed,
     contenders_here,
     measure_blend_limit,
@@ -42,14 +41,12 @@ NO_PEAK = PeakRate({}, "no measurement")
 """Of a GPU: what it could do at most is not estimated."""
 
 Progress = Callable[[str, int, int | None], None]
-C = TypeVar("C", bound=BenchmarkedRenderer)
 
 
 def bench_render(
     sizes: Sequence[Size],
     repeats: int,
     out: Path,
-    opensplat: str | None,
     progress: Progress,
     device: str | None = None,
 ) -> dict[str, Any]:
@@ -62,7 +59,7 @@ def bench_render(
     """
     require(device)
     _make_folder(out)
-    contenders, notes = contenders_here(opensplat, device)
+    contenders, notes = contenders_here(device)
     counts = (1,) if device == "cuda" else thread_counts()
     peak = NO_PEAK if device == "cuda" else _limits(measure_peak(counts), contenders)
     described = {
@@ -71,7 +68,7 @@ def bench_render(
         "peak_method": peak.method,
         "blend_limit": {isa: asdict(limit) for isa, limit in peak.blending.items()},
     }
-    kernels = [c for c in contenders if isinstance(c, Timed) and c.name in KERNELS]
+    kernels = [c for c in contenders if c.name in KERNELS]
     working = _that_run(kernels, height_field(SMALL), notes)
     errors = gradient_errors([c.renderer for c in working], height_field(SMALL))
     drawn_on = kernels[0].renderer.device if device == "cuda" else CPU
@@ -88,7 +85,7 @@ def bench_render(
     return result
 
 
-def _limits(peak: PeakRate, contenders: Sequence[BenchmarkedRenderer]) -> PeakRate:
+def _limits(peak: PeakRate, contenders: Sequence[Timed]) -> PeakRate:
     """The peak, with what the blending loops of each instruction set do at most."""
     isas = sorted({contender.isa for contender in contenders if contender.name == "cpu"})
     return replace(peak, blending={isa: measure_blend_limit(isa) for isa in isas})
@@ -102,7 +99,7 @@ def _make_folder(out: Path) -> None:
 
 
 def time_sizes(
-    contenders: Sequence[BenchmarkedRenderer],
+    contenders: Sequence[Timed],
     sizes: Sequence[Size],
     repeats: int,
     peak: PeakRate,
@@ -127,14 +124,14 @@ def time_sizes(
     return rows
 
 
-def _that_run(contenders: Sequence[C], scene: SplatScene, notes: list[str]) -> list[C]:
+def _that_run(contenders: Sequence[Timed], scene: SplatScene, notes: list[str]) -> list[Timed]:
     """Those that get through the scene once: a run that is not counted."""
     return [c for c in contenders if _attempt(c, scene, notes) is not None]
 
 
 def _samples(
-    contenders: Sequence[BenchmarkedRenderer], scene: SplatScene, repeats: int, notes: list[str]
-) -> list[tuple[BenchmarkedRenderer, list[Sample]]]:
+    contenders: Sequence[Timed], scene: SplatScene, repeats: int, notes: list[str]
+) -> list[tuple[Timed, list[Sample]]]:
     """Interleaved; a contender that fails once has none."""
     jobs = [partial(_attempt, contender, scene, notes) for contender in contenders]
     found = []
@@ -145,7 +142,7 @@ def _samples(
     return found
 
 
-def _attempt(contender: BenchmarkedRenderer, scene: SplatScene, notes: list[str]) -> Sample | None:
+def _attempt(contender: Timed, scene: SplatScene, notes: list[str]) -> Sample | None:
     try:
         return contender.sample(scene)
     except FAILURES as error:

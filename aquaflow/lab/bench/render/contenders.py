@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shlex
-import shutil
-import subprocess
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Protocol
 
 import torch
 
-from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.lab.bench.meter import Meter
 from aquaflow.lab.bench.render.timing import Clock, Sample, time_renderer, torch_threads
 from aquaflow.render.contract import Renderer
 from aquaflow.render.cpu import CpuRenderer, TileRenderer
-from aquaflow.render.example_scene import NAMES, SMALL, Size, SplatScene, height_field
+from aquaflow.render.example_scene import SMALL, Size, SplatScene, height_field
 from aquaflow.render.gsplat import GsplatRenderer
 from aquaflow.render.library import NativeUnavailableError
 from aquaflow.render.native.build import supported_isas
@@ -30,41 +23,9 @@ REFERENCE_MOST = SMALL.n * SMALL.pixels
 """Gaussians times pixels: beyond, the torch fallback takes minutes and the reference memory."""
 
 
-class BenchmarkedRenderer(Protocol):
-    """A renderer that draws a scene and its gradients, and reports the times."""
-
-    @property
-    def name(self) -> str:
-        """Name of the renderer or program, for the table."""
-        ...
-
-    @property
-    def isa(self) -> str:
-        """Instruction set that it runs on, or ``torch``, ``cuda``."""
-        ...
-
-    @property
-    def threads(self) -> int:
-        """Threads that it runs on."""
-        ...
-
-    @property
-    def slow(self) -> bool:
-        """Seconds rather than milliseconds: run once, after the others."""
-        ...
-
-    def takes(self, size: Size) -> bool:
-        """Whether a scene of this size takes a reasonable time."""
-        ...
-
-    def sample(self, scene: SplatScene) -> Sample:
-        """One timed run."""
-        ...
-
-
 @dataclass(frozen=True)
 class Timed:
-    """A renderer of this package as a contender."""
+    """A renderer as a contender: draws a scene and its gradients, and reports the times."""
 
     renderer: Renderer
     most: int | None = None
@@ -89,12 +50,15 @@ class Timed:
 
     @property
     def slow(self) -> bool:
+        """Seconds rather than milliseconds: run once, after the others."""
         return self.most is not None
 
     def takes(self, size: Size) -> bool:
+        """Whether a scene of this size takes a reasonable time."""
         return self.most is None or size.n * size.pixels <= self.most
 
     def sample(self, scene: SplatScene) -> Sample:
+        """One timed run."""
         # The kernels have a pool of their own, and idle threads of torch spin on its processors.
         ours = isinstance(self.renderer, CpuRenderer)
         with torch_threads(1 if ours else self.threads):
@@ -116,9 +80,7 @@ def contenders_on_gpu() -> list[Timed]:
     return [Timed(gsplat), Timed(ReferenceRenderer(gsplat.device), REFERENCE_MOST)]
 
 
-def contenders_here(
-    opensplat: str | None = None, device: str | None = None
-) -> tuple[list[BenchmarkedRenderer], list[str]]:
+def contenders_here(device: str | None = None) -> tuple[list[Timed], list[str]]:
     """The contenders, and one sentence for each that is missing or needs a remark.
 
     All that run here, or those on ``device``: cpu or cuda.
@@ -127,8 +89,8 @@ def contenders_here(
         AquaFlowError: nothing draws on the device asked for.
     """
     if device == "cuda":
-        return [*contenders_on_gpu()], []
-    found: list[BenchmarkedRenderer] = []
+        return contenders_on_gpu(), []
+    found: list[Timed] = []
     notes: list[str] = []
     for isa in supported_isas():
         try:
@@ -142,102 +104,7 @@ def contenders_here(
             notes.append(f"gsplat is not timed: {error}")
     found += [Timed(TileRenderer(count), TILES_MOST) for count in thread_counts()]
     found.append(Timed(ReferenceRenderer(), REFERENCE_MOST))
-    if opensplat is not None:
-        found.append(OpenSplat(opensplat))
-        notes.append(NOTE)
     return found, notes
-
-
-# --------------------------------------------------------------------------------------------------
-# OpenSplat's CPU kernels compared with ours, through a program that the user brings.
-#
-# OpenSplat is AGPL: AquaFlow neither holds nor loads any of it. The program is called as ``COMMAND
-# FOLDER``, once for every sample. FOLDER holds ``scene.json`` (``n``, ``width``, ``height``, and
-# ``arrays``: name -> shape) and for each array ``NAME.f32``: float32, little-endian, row-major.
-# Names, axes and units are those of the renderer contract; ``K`` is the 3 x 3 intrinsic matrix,
-# ``g_image`` and ``g_alpha`` are the gradients that come in. Colours have three channels, all that
-# OpenSplat draws. The last line that the program prints is ``{"fwd_ms": number, "bwd_ms":
-# number}``, warm-up and loading not counted.
-
-NOTE = (
-    "OpenSplat's CPU depth sort, built against current torch as it is, reads a strided depth "
-    "tensor as contiguous and sorts by the wrong key: compare its times, not its pictures. Its "
-    "kernel is serial and draws three channels where the others draw four."
-)
-"""Printed with its numbers."""
-LIMIT_S = 600.0
-"""A program that takes longer has failed."""
-CHANNELS = 3
-"""Red, green, blue; the others draw the range too."""
-
-
-class OpenSplat:
-    """A contender whose samples come from the user's program."""
-
-    name = "opensplat"
-    isa = "user's build"
-    threads = 1
-    slow = True
-
-    def __init__(self, command: str) -> None:
-        """Raises InputError when there is no such program."""
-        self.command = command
-        try:
-            self.words = shlex.split(command)
-        except ValueError as error:
-            raise InputError(f"--opensplat {command} is no command: {error}") from error
-        if not self.words or shutil.which(self.words[0]) is None:
-            raise InputError(
-                f"--opensplat {command}: there is no such program; give COMMAND [ARGS]"
-            )
-
-    def takes(self, size: Size) -> bool:
-        """The user's program is asked for every size."""
-        return True
-
-    def sample(self, scene: SplatScene) -> Sample:
-        """Raises InputError when the program fails or does not print its times."""
-        with tempfile.TemporaryDirectory() as folder:
-            write_scene(scene, Path(folder))
-            printed = self._run(folder)
-        try:
-            said = json.loads(printed.strip().splitlines()[-1])
-            return Sample(float(said["fwd_ms"]), float(said["bwd_ms"]))
-        except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"--opensplat {self.command}: its last line is not "
-                '{"fwd_ms": number, "bwd_ms": number}; print that'
-            ) from error
-
-    def _run(self, folder: str) -> str:
-        try:
-            done = subprocess.run(
-                [*self.words, folder],
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=LIMIT_S,
-                check=False,
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise InputError(f"--opensplat {self.command} does not run: {error}") from error
-        if done.returncode != 0:
-            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-            raise InputError(f"--opensplat {self.command} failed ({done.returncode}): {last}")
-        return done.stdout
-
-
-def write_scene(scene: SplatScene, folder: Path) -> None:
-    """The files that the program reads."""
-    arrays = dict(zip(NAMES, scene.inputs, strict=True))
-    arrays |= {"K": scene.K, "g_image": scene.g_image, "g_alpha": scene.g_alpha}
-    for name in ("colours", "g_image"):
-        arrays[name] = arrays[name][..., :CHANNELS]
-    for name, tensor in arrays.items():
-        tensor.contiguous().numpy().astype("<f4").tofile(folder / f"{name}.f32")
-    size = {"n": scene.size.n, "width": scene.size.width, "height": scene.size.height}
-    shapes = {name: list(tensor.shape) for name, tensor in arrays.items()}
-    (folder / "scene.json").write_text(json.dumps({**size, "arrays": shapes}) + "\n")
 
 
 # --------------------------------------------------------------------------------------------------

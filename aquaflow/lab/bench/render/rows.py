@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from aquaflow.lab.bench.render.contenders import BenchmarkedRenderer
+from aquaflow.lab.bench.render.contenders import Timed
 from aquaflow.lab.bench.render.interactions import BACKWARD_FLOP, FORWARD_FLOP
 from aquaflow.lab.bench.render.peak import PeakRate
 from aquaflow.lab.bench.render.timing import Sample, spread_of
@@ -18,7 +18,7 @@ PASSES = (("fwd", FORWARD_FLOP), ("bwd", BACKWARD_FLOP))
 
 
 def row_of(
-    contender: BenchmarkedRenderer,
+    contender: Timed,
     size: Size,
     samples: Sequence[Sample],
     interactions: int,
@@ -64,7 +64,7 @@ def _median(samples: Sequence[Sample], name: str) -> float | None:
 
 
 def _shares(
-    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: PeakRate
+    contender: Timed, busy_s: dict[str, float], interactions: int, peak: PeakRate
 ) -> dict[str, float] | None:
     """Useful operations/s over the peak's; None where no peak was measured for the device."""
     most = None if contender.isa == "cuda" else peak.flop_per_s.get(contender.threads)
@@ -76,7 +76,7 @@ def _shares(
 
 
 def _blend_shares(
-    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: PeakRate
+    contender: Timed, busy_s: dict[str, float], interactions: int, peak: PeakRate
 ) -> dict[str, float] | None:
     """Of the rate at which the kernels blend where nothing is in vain and nothing else is done."""
     limit = peak.blending.get(contender.isa)

@@ -246,7 +246,7 @@ class MappedScene:
         if number not in self._seen:
             real = self._mapped[number].camera
             width, height = REAL_WIDTH, round(REAL_WIDTH * real.height / real.width)
-            K = torch.from_numpy(real.scaled(width, height).K).float()[None]
+            K = torch.from_numpy(real.resize(width, height).K).float()[None]
             self._seen[number] = self._draw(K, self.T_wc[number][None], width, height)
         return self._seen[number]
 

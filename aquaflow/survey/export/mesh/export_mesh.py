@@ -120,24 +120,29 @@ def export_mesh(
 
     seen = "without water" if through is None else f"through {through:.3g} {where.unit} of water"
     placed = _place_mesh(surface, where, seen)
+    files, size = [path], None
     if kind == "ply":
         vertices = surface.mesh.vertices
         found = [colour(vertices[part])[0] for part in batches(len(vertices))]
         write_mesh_ply(path, placed, np.concatenate(found))
-        files, size = [path], None
     else:
         layout = lay_out(surface.mesh, surface.voxel / VOXEL_PX)
         picture = paint(surface.mesh, layout, colour, partial(report, "texture"))
-        texture, size = Texture(layout, picture), (layout.width, layout.height)
-        files = [path]
-        if kind == "obj":
-            files = write_obj(path, placed, texture)
-        else:
-            write_glb(path, placed, texture)
+        files = _write_textured(path, kind, placed, Texture(layout, picture))
+        size = (layout.width, layout.height)
     return WrittenMesh(
         files, len(surface.mesh.vertices), len(surface.mesh.faces), surface.mesh.area(),
         surface.voxel, float(np.median(surface.sigma)), size, where, placed.origin, seen,
     )  # fmt: skip
+
+
+def _write_textured(
+    path: Path, kind: Literal["obj", "glb"], placed: PlacedMesh, texture: Texture
+) -> list[Path]:
+    if kind == "obj":
+        return write_obj(path, placed, texture)
+    write_glb(path, placed, texture)
+    return [path]
 
 
 def _nothing(what: str, done: int, total: int) -> None:

@@ -33,6 +33,14 @@ class GridTile:
     width: int
     """Pixels."""
 
+    @property
+    def part(self) -> tuple[slice, slice]:
+        """Its rows and columns in the raster."""
+        return (
+            slice(self.row, self.row + self.height),
+            slice(self.column, self.column + self.width),
+        )
+
 
 @dataclass(frozen=True)
 class Grid:

@@ -212,17 +212,10 @@ def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
     for tile in grid.tiles():
         chosen = splats.reaching(grid, tile)
         if len(chosen):
-            picture[_part(tile)] = _tile(splats, colours, grid, tile, chosen, distance)
+            picture[tile.part] = _tile(splats, colours, grid, tile, chosen, distance)
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "PNG")
     return buffer.getvalue()
-
-
-def _part(tile: GridTile) -> tuple[slice, slice]:
-    return (
-        slice(tile.row, tile.row + tile.height),
-        slice(tile.column, tile.column + tile.width),
-    )
 
 
 def _tile(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -12,21 +11,18 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from aquaflow.base.errors import InputError
 from aquaflow.cli import app
 from aquaflow.lab.bench.render import benchmark as bm
 from aquaflow.lab.bench.render import peak as peaks
 from aquaflow.lab.bench.render import table as sizes
 from aquaflow.lab.bench.render.contenders import (
-    NOTE,
-    OpenSplat,
     Timed,
     contenders_here,
     thread_counts,
 )
 from aquaflow.lab.bench.render.parts import parts_of
 from aquaflow.lab.bench.render.table import SIZES, print_result
-from aquaflow.render.example_scene import NAMES, SMALL, Size, height_field
+from aquaflow.render.example_scene import NAMES, SMALL, Size
 from aquaflow.render.native.build import supported_isas
 from tests.command_line import refused, run_aquaflow
 from tests.lab.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
@@ -49,48 +45,13 @@ def test_everything_that_runs_here_is_a_contender() -> None:
     assert all(c.takes(SMALL) for c in found)
 
 
-def script(folder: Path, ending: str) -> str:
-    """A program as the user would bring it: reads the scene, then does as ``ending`` says."""
-    file = folder / "peer.py"
-    file.write_text(
-        "import json, pathlib, sys\n"
-        "folder = pathlib.Path(sys.argv[1])\n"
-        "scene = json.loads((folder / 'scene.json').read_text())\n"
-        "bytes_of = {n: (folder / f'{n}.f32').stat().st_size for n in scene['arrays']}\n" + ending
-    )
-    return f"{sys.executable} {file}"
-
-
-def test_opensplat_gets_the_scene_and_says_its_times(tmp_path: Path) -> None:
-    ending = (
-        f"assert set(scene['arrays']) == set({[*NAMES, 'K', 'g_image', 'g_alpha']!r})\n"
-        "assert scene['arrays']['colours'] == [scene['n'], 3]\n"
-        "assert scene['arrays']['g_image'] == [scene['height'], scene['width'], 3]\n"
-        "assert bytes_of['means'] == 4 * 3 * scene['n']\n"
-        "print('warming up')\n"
-        "print(json.dumps({'fwd_ms': 7, 'bwd_ms': scene['n'] / 100}))\n"
-    )
-    sample = OpenSplat(script(tmp_path, ending)).sample(height_field(TINY))
-    assert (sample.fwd_ms, sample.bwd_ms, sample.fwd_cpu_ms) == (7.0, 2.0, None)
-    found, notes = contenders_here(script(tmp_path, ending))
-    assert found[-1].name == "opensplat"
-    assert NOTE in notes
-
-
-@pytest.mark.parametrize(
-    ("ending", "said"),
-    [("sys.exit('no such GPU')", "no such GPU"), ("print('done')", "its last line is not")],
-)
-def test_a_peer_that_fails_costs_only_its_own_row(tmp_path: Path, ending: str, said: str) -> None:
-    peer = OpenSplat(script(tmp_path, ending))
+def test_a_renderer_that_fails_costs_only_its_own_row() -> None:
     full = Timed(Pretended(SlowedClock(), fails_after=0))
     time, notes = SlowedClock(), list[str]()
     good = Timed(Pretended(time), clock=time.clock())
-    rows = bm.time_sizes([full, peer, good], [TINY], 2, PEAK, notes, quiet)
+    rows = bm.time_sizes([full, good], [TINY], 2, PEAK, notes, quiet)
     assert [(row["renderer"], row["n"], row["repeats"]) for row in rows] == [("pretended", 200, 2)]
-    assert len(notes) == 2
-    assert notes[0] == "pretended (none) failed at 400, 96 x 72: no room"
-    assert said in notes[1]
+    assert notes == ["pretended (none) failed at 400, 96 x 72: no room"]
 
 
 def test_a_renderer_that_fails_between_its_repeats_has_no_row() -> None:
@@ -98,12 +59,6 @@ def test_a_renderer_that_fails_between_its_repeats_has_no_row() -> None:
     tiring = Timed(Pretended(time, fails_after=3), clock=time.clock())  # two of them uncounted
     assert bm.time_sizes([tiring], [TINY], 2, PEAK, notes, quiet) == []
     assert notes == ["pretended (none) failed at 200, 52 x 39: no room"]
-
-
-@pytest.mark.parametrize("command", ["", "no-such-program --fast", "'unclosed"])
-def test_a_peer_that_is_not_there_is_refused(command: str) -> None:
-    with pytest.raises(InputError, match="--opensplat"):
-        OpenSplat(command)
 
 
 @pytest.fixture
@@ -172,16 +127,13 @@ def test_bench_render_refuses_in_one_sentence(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("x")
     refused(run_aquaflow("lab", "bench", "render", "--out", file), file)
-    refused(
-        run_aquaflow("lab", "bench", "render", "--opensplat", "no-such-program"), "no-such-program"
-    )
 
 
 @pytest.mark.parametrize(
     ("arguments", "shown"),
     [
         (("lab", "bench", "--help"), "--suite"),
-        (("lab", "bench", "render", "--help"), "--opensplat"),
+        (("lab", "bench", "render", "--help"), "--repeats"),
     ],
 )
 def test_both_commands_explain_themselves(arguments: tuple[str, ...], shown: str) -> None:

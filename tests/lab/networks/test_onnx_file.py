@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from aquaflow.prior.onnx_file import write_onnx
+from aquaflow.lab.networks.onnx_file import write_onnx
 
 pytestmark = pytest.mark.usefixtures("onnxscript")
 

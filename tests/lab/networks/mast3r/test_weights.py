@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from aquaflow.base.errors import InputError
-from aquaflow.prior.mast3r.export import load_checkpoint
-from aquaflow.prior.mast3r.network import TINY, Mast3r
+from aquaflow.lab.networks.mast3r.export import load_checkpoint
+from aquaflow.lab.networks.mast3r.network import TINY, Mast3r
 
 
 @pytest.fixture

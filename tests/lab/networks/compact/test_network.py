@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.prior.compact.network import (
+from aquaflow.lab.networks.compact.network import (
     COARSE,
     FINE,
     CompactPrior,

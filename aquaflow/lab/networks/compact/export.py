@@ -20,9 +20,9 @@ from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.prior.compact.network import COARSE, STRIDE, CompactPrior, Compared, Encoded
+from aquaflow.lab.networks.compact.network import COARSE, STRIDE, CompactPrior, Compared, Encoded
+from aquaflow.lab.networks.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card
-from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings, quantise
 
 LICENCE = "Apache-2.0; trained on generated pictures only"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from aquaflow.base.errors import InputError
-from aquaflow.recordings.telemetry_json import sample_schema
+from aquaflow.recordings.telemetry_lines import sample_schema
 
 LIBRARY = "aquaflow"
 """Who wrote the file, in its header."""
@@ -16,19 +14,6 @@ RAW_BYTES = "application/octet-stream"
 """Encoding of what a link received, as it came."""
 JSON_OBJECT = b'{"type": "object"}'
 """Schema of objects that have none of their own."""
-
-
-def require_mcap() -> None:
-    """Check that the libraries of the extra ``recording`` are installed.
-
-    Raises:
-        InputError: mcap or foxglove's schemas are not installed.
-    """
-    for module in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"):
-        if find_spec(module) is None:
-            raise InputError(
-                f"MCAP files need {module}; install it with pip install 'aquaflow[recording]'"
-            )
 
 
 class DiveFile:

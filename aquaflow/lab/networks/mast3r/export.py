@@ -15,9 +15,16 @@ import torch
 from torch import Tensor, nn
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.lab.networks.mast3r.network import (
+    FULL,
+    PATCH_PX,
+    TINY,
+    Mast3r,
+    Mast3rSize,
+    ViewGeometry,
+)
+from aquaflow.lab.networks.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, sha256_of, write_card
-from aquaflow.prior.mast3r.network import FULL, PATCH_PX, TINY, Mast3r, Mast3rSize, ViewGeometry
-from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 OUTPUTS = tuple(f"{symbol}_{view}" for view in "ab" for symbol in ViewGeometry._fields)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from aquaflow import cli
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.cli import prior
-from aquaflow.prior.compact.export import (
+from aquaflow.lab.networks.compact.export import (
     INPUTS,
     LICENCE,
     LICENCE_WITH_PICTURES,
@@ -24,7 +24,7 @@ from aquaflow.prior.compact.export import (
     load_checkpoint,
     parity_of,
 )
-from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
+from aquaflow.lab.networks.compact.network import COARSE, CompactPrior, NetworkSize
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
 from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift

@@ -1,4 +1,4 @@
-"""A network camera made of a recording that sends bare MPEG-TS over UDP."""
+"""A network camera that sends bare MPEG-TS over UDP."""
 
 from __future__ import annotations
 

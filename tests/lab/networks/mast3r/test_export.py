@@ -18,12 +18,12 @@ from aquaflow import cli
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import PriorConfig
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.lab.networks.mast3r.export import OUTPUTS, export, parity_of, relative_difference
+from aquaflow.lab.networks.mast3r.network import TINY, Mast3r
 from aquaflow.prior import runtime
 from aquaflow.prior.factory import make_prior
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, read_card
 from aquaflow.prior.hybrid import HybridEncoding
-from aquaflow.prior.mast3r.export import OUTPUTS, export, parity_of, relative_difference
-from aquaflow.prior.mast3r.network import TINY, Mast3r
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 pytestmark = [pytest.mark.ci, pytest.mark.usefixtures("onnxscript")]

@@ -10,13 +10,13 @@ import torch
 
 from aquaflow.config.tracking import PriorConfig
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.lab.networks.mast3r.export import export
+from aquaflow.lab.networks.mast3r.network import TINY, Mast3r
 from aquaflow.prior import flow as dense
 from aquaflow.prior.factory import make_prior
 from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.hybrid import HybridPair, HybridPrior
-from aquaflow.prior.mast3r.describer import CELL_PX, Mast3rDescriber
-from aquaflow.prior.mast3r.export import export
-from aquaflow.prior.mast3r.network import TINY, Mast3r
+from aquaflow.prior.mast3r_describer import CELL_PX, Mast3rDescriber
 from aquaflow.prior.runtime import RuntimeSettings
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from aquaflow.sources.wall_clock import WallClock
+from aquaflow.live.clock_reading import WallClock
 from aquaflow.types import UtcTime
 
 SECOND = 1_000_000_000

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.prior.mast3r.network import (
+from aquaflow.lab.networks.mast3r.network import (
     FULL,
     PATCH_PX,
     TINY,
@@ -22,7 +22,7 @@ from aquaflow.prior.mast3r.network import (
     rotary_table,
 )
 
-KEYS = Path(__file__).parents[4] / "shared" / "design" / "mast3r_keys.txt"
+KEYS = Path(__file__).parents[5] / "shared" / "design" / "mast3r_keys.txt"
 LAYOUT_SHA256 = "1e4692eac072c410a86211e06a9a3007d91134cf353bbabe874b0006754f9cc4"
 """Of the sorted lines "name shape" of the public checkpoint."""
 

@@ -10,7 +10,7 @@ import pytest
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import SourceConfig
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.sources.reading import MOST_UNREADABLE, read_past_failures
+from aquaflow.recordings.playback import MOST_UNREADABLE, read_past_failures
 from aquaflow.types import Depth, Dropped, Frame
 
 COUNT = 20
