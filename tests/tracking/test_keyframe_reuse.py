@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from threading import Event
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -15,9 +17,10 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.tracking.keyframe_reuse import STAGE, ReuseResult
+from aquaflow.tracking.keyframe_reuse import STAGE, ReuseResult, leaves
 from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracked_clips import PLACED, QUICK, SMALL, error_share, path, told
+from tests.tracking.tracking_scenes import CAMERA, pose
 
 THERE = path(12)
 HOVER = [*THERE, *(THERE[::-1] + THERE) * 2]
@@ -144,3 +147,27 @@ def test_where_looking_fails_a_keyframe_is_made(
     assert failure.first_frame is not None
     assert swim.store.keyframes[-1].frame_index > failure.first_frame
     assert {t.frame_class for t in swim.tracked} <= PLACED
+
+
+@pytest.mark.parametrize(
+    ("here", "parallax_px", "left"),
+    [
+        ((0.0, 0.0, -0.3), 8.0, True),
+        ((0.0, 0.0, -0.3), 2.0, False),  # matches are lost for another reason
+        ((0.0, 0.0, -0.05), 8.0, False),  # it only turned
+        ((0.0, 0.0, 0.25), 8.0, False),  # it comes back to the others
+    ],
+)
+def test_a_camera_leaves_its_keyframes_that_is_beyond_all_of_them(
+    here: tuple[float, float, float], parallax_px: float, left: bool
+) -> None:
+    still = (0.0, 0.0, 0.0)
+    others = [SimpleNamespace(keyframe=SimpleNamespace(T_wc=pose(still, (0.0, 0.0, 0.3))))]
+    look: Any = SimpleNamespace(
+        at=SimpleNamespace(keyframe=SimpleNamespace(T_wc=pose(still, still))),
+        T_fk=pose(still, here).inverse(),
+        solved=SimpleNamespace(parallax_px=parallax_px),
+        camera=CAMERA,
+        around=others,
+    )
+    assert leaves(look) == left
