@@ -123,11 +123,11 @@ class InsertionConfig(StageConfig):
         "bare. Gaussians are placed at the first in both cases",
     )
     density: float = Field(
-        2.5,
+        5.0,
         gt=0,
         le=100,
-        description="Gaussians per pixel for each unit of structure, at most one in a pixel; with "
-        "1 Curasao and IUI3 are 0.9 and 1.6 dB worse after as many steps, the reef clip 0.2",
+        description="Gaussians per pixel for each unit of structure in an empty map, at most one "
+        "in a pixel; falls to 1 as the map fills (notes/2026-11-mapping.md#density)",
     )
     bare_probability: Lab[float] = Field(
         0.06, ge=0, le=1, description="least P_a where the map does not cover the picture"
@@ -184,7 +184,7 @@ class OptimiserConfig(StageConfig):
     steps_mapping: Lab[int] = Field(
         20, ge=0, description="steps after a mapping frame (ARTDECO: 20)"
     )
-    steps_common: Lab[int] = Field(5, ge=0, description="steps after a common frame (ARTDECO: 10)")
+    steps_common: Lab[int] = Field(2, ge=0, description="steps after a common frame (ARTDECO: 10)")
     refine_steps: int = Field(
         800, ge=0, description="steps after the last frame (notes/2026-11-mapping.md#refining)"
     )

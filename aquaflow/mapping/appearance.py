@@ -164,7 +164,10 @@ def _looks(mapper: Mapper, find_light: bool) -> _Looks:
     for view in spread:
         shown = mapper.show(view)
         own = restored_own(mapper.scene, view, shown)
-        samples.append(seen_and_clear(view, shown, own))
+        if view.has_pixels and view.image.size:
+            samples.append(_in_picture(mapper.scene, view, shown))
+        else:
+            samples.append(seen_and_clear(view, shown, own))
         if find_light:
             picture, weight = _weigh(mapper.scene, view, shown, own)
             if (found := methods_in(picture, weight)) is not None:
@@ -182,6 +185,13 @@ def seen_and_clear(view: View, shown: RenderedMap, own: Recovered) -> tuple[Arra
     judged = was_restored(view, shown, own)[grid]
     seen, clear = shown.image[grid][judged], own.picture[grid][judged]
     return picture_out(seen).astype(np.float64), picture_out(clear).astype(np.float64)
+
+
+def _in_picture(scene: Scene, view: View, shown: RenderedMap) -> tuple[Array, Array]:
+    """[n, 3] colours of what was restored of the view's picture, as it is and without water. The
+    map lacks its finest detail, which restoration makes stronger, and so darker on the mean."""
+    recovered = scene.recover(view, scene.evenly_lit(view), shown.z)
+    return seen_and_clear(view, replace(shown, image=view.target()), recovered)
 
 
 def _weigh(

@@ -242,9 +242,19 @@ def insertion_probability(
     return torch.maximum(P.clamp_min(0.0), bare)
 
 
+def density_for(most: float, filled: float) -> float:
+    """Gaussians per pixel for each unit of P_a, when the share ``filled`` of the map's cap is used.
+
+    It falls from ``most`` to 1: a small scene gets all the detail that there is room for, and the
+    first views of a large one do not leave the others bare.
+    """
+    return max(min(most, 1.0), most * (1.0 - filled))
+
+
 def select(
     probability: Tensor,  # [H, W] P_a
     allowed: Tensor,  # [H, W] bool
+    density: float,
     config: InsertionConfig,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
@@ -254,7 +264,7 @@ def select(
     if config.selection == "threshold":
         drawn = above
     else:
-        chance = torch.where(above, probability * config.density, 0.0)
+        chance = torch.where(above, probability * density, 0.0)
         drawn = insertion_in(torch.rand(chance.shape, generator=generator), chance.device) < chance
     rows, columns = torch.nonzero(drawn & allowed, as_tuple=True)
     return rows, columns
@@ -294,6 +304,7 @@ def new_gaussians(
     colour: Tensor,  # [H, W, 3] J-hat
     confidence: Tensor,  # [H, W] in [0, 1]
     probability: Tensor,  # [H, W] P_a
+    density: float,
     config: InsertionConfig,
 ) -> dict[str, Tensor]:
     """Start values: on the pixel's ray, as wide as the expected spacing, coloured by J-hat.
@@ -306,7 +317,7 @@ def new_gaussians(
     distance = insertion_out(z[rows, columns]).astype(np.float64)
     means = (rays * distance[:, None]) @ view.T_wc.R.T + view.T_wc.t
     # Expected distance to the nearest neighbour when a share p of the pixels is drawn: 1 / sqrt(p).
-    share = (probability[rows, columns] * config.density).clamp(1e-4, 1.0)
+    share = (probability[rows, columns] * density).clamp(1e-4, 1.0)
     if config.selection == "threshold":
         share = torch.ones_like(share)  # neighbours are a pixel apart
     spacing = share.rsqrt().clamp(1.0, MAX_SPACING_WIDTHS * view.camera.width)

@@ -18,6 +18,7 @@ from aquaflow.mapping.gaussians import (
     GaussianMap,
     alpha_where_agreed,
     colour_range,
+    density_for,
     insertion_probability,
     move_gaussians,
     move_views,
@@ -134,7 +135,8 @@ class Mapper:
 
         # Pixels where that is enough, or drawn with that probability.
         allowed = tracked.known & recoverable & view.scene_mask()
-        rows, columns = select(P_a, allowed, config, self._random)
+        density = density_for(config.density, len(self.gaussians) / self.config.max_gaussians)
+        rows, columns = select(P_a, allowed, density, config, self._random)
 
         # Room for them below the hard cap.
         rows, columns = self._make_room(rows, columns, agreed_alpha < COVERED_ALPHA)
@@ -142,7 +144,8 @@ class Mapper:
         # Gaussians on the rays of these pixels.
         if len(rows) == 0:
             return 0
-        new = new_gaussians(view, rows, columns, z, J_hat, tracked.confidence, P_a, config)
+        sure = tracked.confidence
+        new = new_gaussians(view, rows, columns, z, J_hat, sure, P_a, density, config)
         return self._append(new, view)
 
     def _restore(

@@ -128,7 +128,9 @@ def best_flow(
     starts: Iterable[Float | None],  # [H, W, 2] px each, a to b; None: from nothing
     near: Float | None = None,  # [H, W, 2] px, a to b
 ) -> ImageFlow:
-    """The flow of the first start that explains the pair, or the one that matches most.
+    """The flow of the first start that explains the pair, or the one whose matches are surest in
+    all: where the picture repeats itself, flow from a wrong start matches as much, but comes back
+    less well.
 
     From ``near``, where it is known well, a quicker flow comes first. ``starts`` is asked for the
     next one only when those before were not good enough.
@@ -137,15 +139,12 @@ def best_flow(
         flow = matcher(a.grey, b.grey, a.texture, b.texture, near, quick=True)
         if flow.share >= GOOD_SHARE:
             return flow
-    best: ImageFlow | None = None
+    flows: list[ImageFlow] = []
     for start in starts:
-        flow = matcher(a.grey, b.grey, a.texture, b.texture, start)
-        if best is None or flow.share > best.share:
-            best = flow
-        if best.share >= GOOD_SHARE:
-            break
-    assert best is not None
-    return best
+        flows.append(matcher(a.grey, b.grey, a.texture, b.texture, start))
+        if flows[-1].share >= GOOD_SHARE:
+            return flows[-1]
+    return flows[0] if len(flows) == 1 else max(flows, key=lambda f: dense.confidence(f).sum())
 
 
 def from_prediction(

@@ -36,7 +36,7 @@ from aquaflow.tracking.pose.matcher import (
     is_wide,
     predicted_matches,
 )
-from aquaflow.tracking.wide_steps import WideSteps
+from aquaflow.tracking.wide_steps import WideSteps, match_by_chance
 from aquaflow.types import Frame
 
 RETURN_WIDTHS = 0.03
@@ -155,12 +155,13 @@ class KeyframeTracker:
         self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel, solved: Matched | None
     ) -> Matched | None:
         """``solved``, unless the frame shows hardly anything of the keyframe that has a depth
-        yet."""
+        yet: the little that is known fits any pose."""
         if solved is not None and solved.known_share >= self._config.least_known_share:
             return solved
         reference, predicted = self._reference(at), at.motion @ at.T_fk
         turned = self._wide_steps.after_turn(at.keyframe, reference, encoding, camera, predicted)
-        return turned or solved
+        by_chance = solved is not None and match_by_chance(solved.pair)
+        return turned or (None if by_chance else solved)
 
     def _seed(self, at: CurrentKeyframe, predicted: Sim3, camera: CameraModel) -> Float | None:
         """Where the frame's matches are looked for first: at the last ones, or, where telemetry

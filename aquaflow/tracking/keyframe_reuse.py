@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
@@ -23,6 +25,9 @@ STAGE = "return to a keyframe"
 """Name of this work."""
 CROWD_LOOK_LOSS = 0.05
 """Fall of the matched share from which a crowded place is searched before its time is over."""
+APART = 0.5
+"""Of the distance between the keyframe in use and the one next to it, how far beyond the one in use
+a camera has left them; less lies between keyframes."""
 RETURN_SHARE = 0.75
 """Matched share from which an earlier keyframe is used again; above ``tracking.keyframe_share``, so
 that it is not left at the next frame."""
@@ -140,7 +145,19 @@ class KeyframeReuse:
             self._in_vain = look.at
 
     def _is_crowded(self, look: ReuseRequest) -> bool:
-        return len(look.around) >= self._config.crowd
+        return len(look.around) >= self._config.crowd and not leaves(look)
+
+
+def leaves(look: ReuseRequest) -> bool:
+    """True of a camera that goes away from all keyframes of the place: none is as near as the one
+    in use, and that is not near either. One that moves backwards has all of them in view for long,
+    ever smaller."""
+    in_use = look.at.keyframe.T_wc
+    here = (in_use @ look.T_fk.inverse()).t
+    others = np.stack([neighbour.keyframe.T_wc.t for neighbour in look.around])
+    gone = float(np.linalg.norm(here - in_use.t))
+    nearest, apart = (float(np.linalg.norm(others - at, axis=1).min()) for at in (here, in_use.t))
+    return APART * apart < gone < nearest
 
 
 def carry(back: CurrentKeyframe, look: ReuseRequest) -> None:

@@ -12,8 +12,8 @@ with their light is not all water. And in air or clear water there is nothing to
 of these are there is decided by the models' marginal likelihoods (Laplace's method) under stated
 priors, with errors that neighbours share counted once.
 
-A dive is in water unless there is evidence for clear water, and the likeliest water would not
-show. Where little can be seen of it, the usual water is taken, with its uncertainty.
+A dive is in water unless there is evidence for clear water, and the likeliest water would not show.
+Where little can be seen of it, the usual water is taken, with its uncertainty.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from aquaflow.water.white_balance import WhiteBalance
 Array = npt.NDArray[np.float64]
 
 MIN_POINTS = 100
-"""Fewer points say nothing about the water."""
+"""Fewer say nothing about the water."""
 WATER_IS_USUAL = 5.0
 """Log odds for water before anything is seen: one dive in 150 is in air or in water as clear."""
 NEGLIGIBLE_DEPTH = 0.06
@@ -57,9 +57,9 @@ NEGLIGIBLE_DEPTH = 0.06
 VISIBLE_DEPTH = 0.12
 """Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
 scenes without water look like 0.02 to 0.05."""
-LAMP_SHOWS = 20.0
-"""Log odds for a lamp from which it is taken as seen: up to 5 on rendered dives by daylight and the
-shared clips, 200 to 700 on ten rendered dives with lamps."""
+LAMP_SHOWS = 150.0
+"""Log odds for a lamp from which it is taken as seen: up to 5 by daylight, 84 on AUV surveys, which
+see what their strobes light from one range; 240 to 2100 on ten rendered dives with lamps."""
 EVERY_MODEL = tuple(
     Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible
 )
@@ -91,8 +91,7 @@ class WaterEstimate:
     exposure: Array
     """[V, 3] log-gain of each view, of mean zero."""
     evidence: float | None
-    """Log odds of water against clear water or none, WATER_IS_USUAL not counted; None: only one of
-    the two was tried."""
+    """Log odds of water, WATER_IS_USUAL not counted; None: water or clear water was not tried."""
     nearest: Nearest | None
     """What was seen nearest; None without water."""
     balance: WhiteBalance | None
@@ -164,12 +163,13 @@ def _estimate(
     pictures: Sequence[PosedPicture] = (),
 ) -> Generator[None, None, WaterEstimate]:
     """What the fit, perhaps to open water too, says of the observations of the surface."""
-    seen, trial, water = observations, best.prediction.trial, best.problem
+    shown = yield from _as_pictures_show(best)
+    seen, trial, water = observations, shown.prediction.trial, best.problem
     range_variance = [variance_over_range(seen, seen.colour)] * 2
     sigma = nearest = balance = lightness = None
     if water.model.water:
         sigma = _beta_a_sigma(best)
-        J = best.prediction.J[:, : seen.points]
+        J = shown.prediction.J[:, : seen.points]
         nearest = yield from nearest_of(seen, pictures, trial, J.mean(axis=1))
         balance = white_balance(nearest, water, trial, J, sigma)
         clean = water.without_water(trial, seen.view, seen.xy, seen.z, seen.colour)
@@ -195,12 +195,20 @@ def _estimate(
     )
 
 
+def _as_pictures_show(best: WaterFit) -> Generator[None, None, WaterFit]:
+    """The same water by a lamp at the camera, as pictures are restored: what its mounting and the
+    ground's normals do, of which pictures know nothing, is on the mean in its fall and shading."""
+    if not best.problem.model.lamp:
+        return best
+    return (yield from descend(best.problem.at_the_camera(best.x), best.x, best.noise))
+
+
 def _lamplit(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[None, None, WaterFit]:
     """The likeliest of the problems, all with a lamp, if that is far likelier than ``wet``."""
     if not problems:
         return wet
     richest = max(problems, key=lambda problem: problem.size)
-    first = yield from descend(richest, richest.start, wet.noise)
+    first = yield from descend(richest, richest.adopt(wet.problem, wet.x), wet.noise)
     if first.log_evidence < wet.log_evidence:
         return wet
     (lit,) = yield from fit_likeliest(problems)
@@ -210,8 +218,7 @@ def _lamplit(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[None, N
 
 
 def _is_clear(wet: WaterFit, odds: float) -> bool:
-    """Clear needs evidence, and that the likeliest water would not show; water that takes next to
-    nothing is as good as clear, however sure it is."""
+    """By evidence, if the likeliest water would not show; or as it takes next to nothing."""
     depth = float((np.exp(wet.x[:3]) * wet.problem.median_range).max())
     return depth < NEGLIGIBLE_DEPTH or (odds + WATER_IS_USUAL < 0.0 and depth < VISIBLE_DEPTH)
 
@@ -416,14 +423,12 @@ class WaterFit:
 
     @cached_property
     def repeated_covariance(self) -> Array:
-        """[K, K] of what this very model leaves, which may be more alike than what the richest
-        leaves; that one stated the noise."""
+        """[K, K] by errors as alike as this very model's are; the richest stated the noise."""
         return max(self.repetition(), 1.0) * self.covariance
 
     @cached_property
     def log_evidence(self) -> float:
-        """Log of the model's marginal likelihood by Laplace's method, up to a constant that all
-        models of the same observations share."""
+        """Log of the marginal likelihood (Laplace), but for what all models here share."""
         _, rows = self.problem.priors(self.x)
         prior, posterior = (np.linalg.slogdet(H)[1] for H in (rows.T @ rows, self.information))
         found = cost(self.problem, self.x, self.prediction, self.noise)

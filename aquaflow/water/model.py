@@ -17,6 +17,9 @@ import numpy.typing as npt
 from typing_extensions import Self
 
 from aquaflow.config import WaterPriorsConfig
+from aquaflow.water import mounting
+from aquaflow.water.beliefs import beliefs
+from aquaflow.water.mounting import LampLight, MountedLight
 from aquaflow.water.observations import Observations, RegionalColours
 
 # --------------------------------------------------------------------------------------------------
@@ -53,14 +56,19 @@ TINT_SIGMA = 0.005, 0.1
 """Prior: the same of how much a channel's log-gain differs from the mean of the three."""
 LAMP_SHARE_SIGMA = 1.5
 """Prior: logit of the lamp's share in the light, around a half; weak."""
-LAMP_POWER, LAMP_POWER_SIGMA = 2.05, 0.1
-"""Prior: power of the range by which a lamp's light falls. 2 of a point; ground looked at obliquely
-turns away as it recedes, lamps beside the camera light what is near less: 1.9 to 2.5 on rendered
-dives. Left free (0.25) it takes the attenuation's place."""
+LIT_SHADING_SIGMA = np.array([0.01, 0.01, 0.3, 0.01, 0.3])
+"""Prior: the same with lamps, whose places and cone are numbers of their own: what is left is the
+lens's, and alike on all sides."""
+LAMP_POWER, LAMP_POWER_SIGMA = 2.0, 0.03
+"""Prior: power of the range by which a lamp's light falls, besides what its mounting does: 2 of a
+point. Left free (0.25) it takes the attenuation's place."""
+SEEN_POWER_SIGMA = 0.5
+"""The same where no mounting is known: ground turns away as it recedes, 1.9 to 2.5 on rendered
+dives."""
 GLOW, GLOW_SIGMA = -3.5, 1.0
 """Prior: log of what the water returns of a lamp's light (0.03); 0.02 to 0.1 on rendered dives."""
-LAMP = 2
-"""Logit of the share and the power, of all channels; the glow's three come on top."""
+LAMP = 2 + len(mounting.START)
+"""Logit of the share, the power and the mounting, of all channels; the glow's three come on top."""
 WATER = 9
 """log beta_a, log b and logit B_inf, RGB each."""
 MAX_LOG_RATE = 5.0
@@ -78,6 +86,8 @@ def rate_rows(red: float, red_over_green: float, blue_over_green: float) -> Arra
 
 RATE_ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RED_OVER_GREEN_SIGMA, BLUE_OVER_GREEN_SIGMA)
 """Of water that is not clear."""
+HELD_SIGMA = 1e-4
+"""Of log beta_a where it is given."""
 GREY = np.full((3, 3), 1.0 / 3.0)
 """Takes RGB to the mean of the three."""
 
@@ -172,12 +182,14 @@ class Trial:
     glow: Array = field(default_factory=lambda: np.zeros(3))
     """[3] of the lamp's light that the water returns, nearly all of it close by: as from any range.
     It stands in for the residual of the backscatter."""
+    mounting: Array = field(default_factory=lambda: mounting.START)
+    """[5] of the lamp."""
 
     def transmission(
         self,
         z: Array,  # [...]
     ) -> Array:
-        """[..., 3] share of J that is seen."""
+        """[..., 3] share of J that is seen, by a lamp at the camera."""
         T = np.exp(-self.beta_a * z[..., None])
         return T if self.lamp is None else T * self.lamp.light(self.beta_a, z)
 
@@ -211,7 +223,9 @@ class WaterUnknowns:
             rates = [red, green, green + BLUE_OVER_GREEN]
             self.start[self.water] = [*rates, *rates, *[B_INF_LOGIT] * 3]
         if model.lamp:
-            self.start[self.lamp], self.start[self.glow] = [0.0, LAMP_POWER], GLOW
+            self.start[self.lamp] = [0.0, LAMP_POWER, *mounting.START]
+            self.start[self.glow] = GLOW
+        self._rate_rows, self._power_sigma = RATE_ROWS, LAMP_POWER_SIGMA
         self._rows = self._prior_rows(EXPOSURE_SIGMA[0], TINT_SIGMA[0])
 
     def expecting(
@@ -229,6 +243,18 @@ class WaterUnknowns:
         )
         changed = copy.copy(self)
         changed._rows = self._prior_rows(sigma, tint)
+        return changed
+
+    def holding(
+        self,
+        log_beta_a: Array,  # [3]
+    ) -> Self:
+        """The same, with that attenuation, and a lamp's fall that is not known before."""
+        changed = copy.copy(self)
+        changed.start = self.start.copy()
+        changed.start[:3] = log_beta_a
+        changed._rate_rows, changed._power_sigma = np.eye(3) / HELD_SIGMA, SEEN_POWER_SIGMA
+        changed._rows = changed._prior_rows(EXPOSURE_SIGMA[0], TINT_SIGMA[0])
         return changed
 
     def adopt(
@@ -269,9 +295,10 @@ class WaterUnknowns:
         trial = Trial(wet[0], wet[1], wet[2], unevenness, shading, exposure)
         if not model.lamp:
             return trial
-        logit, power = x[self.lamp].tolist()
+        logit, power = x[self.lamp][:2].tolist()
         glow = np.exp(np.clip(x[self.glow], -MAX_LOGIT, 0.0))
-        return replace(trial, lamp=Lamp(float(_share(logit)), power, self.median_range), glow=glow)
+        lamp = Lamp(float(_share(logit)), power, self.median_range)
+        return replace(trial, lamp=lamp, glow=glow, mounting=x[self.lamp][2:])
 
     def priors(
         self,
@@ -285,16 +312,18 @@ class WaterUnknowns:
         rows = np.zeros((self.size, self.size))
         if self.model.water:
             rates = np.arange(3)
-            rows[:3, :3] = RATE_ROWS
+            rows[:3, :3] = self._rate_rows
             rows[3 + rates, 3 + rates] = 1.0 / RATE_RATIO_SIGMA
             rows[3 + rates, rates] = -1.0 / RATE_RATIO_SIGMA
             rows[6 + rates, 6 + rates] = 1.0 / B_INF_SIGMA
         if self.model.uneven:
             rows[self.uneven, self.uneven] = np.diag(1.0 / UNEVEN_SIGMA)
         if self.model.shading:
-            rows[self.shading, self.shading] = np.diag(1.0 / SHADING_SIGMA)
+            of_lens = LIT_SHADING_SIGMA if self.model.lamp else SHADING_SIGMA
+            rows[self.shading, self.shading] = np.diag(1.0 / of_lens)
         if self.model.lamp:
-            rows[self.lamp, self.lamp] = np.diag([1.0 / LAMP_SHARE_SIGMA, 1.0 / LAMP_POWER_SIGMA])
+            sigma = np.array([LAMP_SHARE_SIGMA, self._power_sigma, *mounting.SIGMA])
+            rows[self.lamp, self.lamp] = np.diag(1.0 / sigma)
             rows[self.glow, self.glow] = np.eye(3) / GLOW_SIGMA
         if self.model.exposure:
             rows[self.exposure, self.exposure] = np.kron(
@@ -369,6 +398,8 @@ class Prediction:
     """[3, M] predicted minus seen."""
     power: Array
     """[3, P] weighted sums of a^2."""
+    light: LampLight | None
+    """Of a lamp."""
 
 
 @dataclass(frozen=True)
@@ -398,12 +429,18 @@ class WaterModel(WaterUnknowns):
         priors: WaterPriorsConfig = BELIEVED,
     ) -> None:
         super().__init__(model, int(seen.view.max()) + 1, seen.median_range)
-        self.seen, self.believed = seen, priors
+        # By a lamp, what is near may well be brighter than white by daylight.
+        self.believed = priors.model_copy(update={"saturation": False}) if model.lamp else priors
+        self.seen = seen
         self._regions = RegionalColours(seen.region)
         self._B_res, self._d = B_res, d
         self._near = B_res[:, None] * np.exp(-d[:, None] * seen.z)
         self._basis = np.ascontiguousarray(shading_basis(seen.xy).T)
         self._colour = np.ascontiguousarray(seen.colour.T)
+        self._mounted: MountedLight | None = None
+        if model.lamp and seen.ray is not None and seen.normal is not None:
+            z = seen.z / seen.median_range
+            self._mounted = MountedLight(seen.ray, seen.normal, z, self._basis)
 
     def predict(
         self,
@@ -413,13 +450,34 @@ class WaterModel(WaterUnknowns):
         """The observations, with the J that fit them best at these weights."""
         trial, seen = self.trial(x), self.seen
         gain = _gain(trial.exposure.T[:, seen.view] + trial.shading @ self._basis)
-        a = gain * trial.transmission(seen.z).T
-        backscatter = gain * self._backscatter(trial, seen.z, self._basis, self._near)
+        a, near, light = gain * np.exp(-trial.beta_a[:, None] * seen.z), self._near, None
+        if trial.lamp is not None:
+            light = self.light_of(trial, trial.lamp)
+            a, near = a * (1.0 - trial.lamp.share + light.beam), light.glow
+        backscatter = gain * self._backscatter(trial, seen.z, self._basis, near)
         weighed = a if weight is None else weight * a
         own = self._colour - backscatter
         power = np.maximum(seen.sums_by_point(weighed * a), TINY)
         J = np.maximum(seen.sums_by_point(weighed * own) / power, 0.0)
-        return Prediction(trial, gain, a, backscatter, J, a * J[:, seen.point] - own, power)
+        return Prediction(trial, gain, a, backscatter, J, a * J[:, seen.point] - own, power, light)
+
+    def at_the_camera(
+        self,
+        x: Array,  # [K] parameters
+    ) -> WaterModel:
+        """The same water, with a lamp at the camera whose fall is that of the light as it is seen:
+        its mounting is not known, nor the surface's normals."""
+        seen = replace(self.seen, ray=None, normal=None)
+        plain = WaterModel(seen, self.model, self._B_res, self._d, self.believed)
+        return plain.holding(x[:3])
+
+    def light_of(self, trial: Trial, lamp: Lamp) -> LampLight:
+        """The trial's lamp on the observations, where it is mounted if that can be told."""
+        beam = lamp.beam(trial.beta_a, self.seen.z).T
+        glow = np.broadcast_to(trial.glow[:, None], beam.shape)
+        if self._mounted is None:
+            return LampLight.of_camera(beam, glow)
+        return self._mounted.light(trial.mounting, beam, glow)
 
     def without_water(
         self,
@@ -433,6 +491,7 @@ class WaterModel(WaterUnknowns):
         basis = np.ascontiguousarray(shading_basis(xy).T)
         lit = colour.T / _gain(trial.exposure.T[:, view] + trial.shading @ basis)
         near = self._B_res[:, None] * np.exp(-self._d[:, None] * z)
+        near = near if trial.lamp is None else trial.glow[:, None]
         veil = self._backscatter(trial, z, basis, near)
         T = np.maximum(trial.transmission(z).T, TINY)
         return np.maximum((lit - veil) / T, 0.0)
@@ -446,8 +505,7 @@ class WaterModel(WaterUnknowns):
     ) -> Array:
         """[3, N] before the camera's gain."""
         if not self.model.water:
-            return np.zeros_like(near)
-        near = near if trial.lamp is None else trial.glow[:, None]
+            return np.zeros((3, len(z)))
         grown = -np.expm1(-trial.b[:, None] * z)
         return np.asarray(_gain(trial.unevenness @ basis) * (trial.B_inf[:, None] * grown + near))
 
@@ -467,8 +525,8 @@ class WaterModel(WaterUnknowns):
             water_gain = now.gain[c] * _gain(trial.unevenness @ self._basis)
             passed = np.exp(-b * seen.z)
             path = seen.z
-            if trial.lamp is not None:
-                beam = trial.lamp.beam(trial.beta_a, seen.z)[:, c]
+            if trial.lamp is not None and now.light is not None:
+                beam, glow = now.light.beam[c], water_gain * now.light.glow[c]
                 lit_by = 1.0 - trial.lamp.share + beam
                 path = path * (1.0 + beam / lit_by)
             direct += [-beta_a * path * light, water_gain * B_inf * b * seen.z * passed]
@@ -477,11 +535,13 @@ class WaterModel(WaterUnknowns):
             direct += list(now.backscatter[c] * self._basis)
         if self.model.shading:
             direct += list(lit * self._basis)
-        if trial.lamp is not None:
+        if trial.lamp is not None and now.light is not None:
             log_nearer = np.log(trial.lamp.range / seen.z)
             share = (1.0 - trial.lamp.share) * (beam - trial.lamp.share)
-            direct += [light * share / lit_by, light * beam / lit_by * log_nearer]
-            direct += [water_gain * trial.glow[c]]
+            by_beam = light * beam / lit_by
+            direct += [light * share / lit_by, by_beam * log_nearer]
+            direct += list(by_beam * now.light.beam_slopes + glow * now.light.glow_slopes)
+            direct += [glow]
         rows = np.stack(direct) if direct else np.zeros((0, len(seen.z)))
         by_J = seen.sums_by_point(weight * a * rows) if len(rows) else np.zeros((0, seen.points))
         if self.model.exposure:
@@ -535,52 +595,3 @@ def _gain(
     log_gain: Array,  # [...]
 ) -> Array:
     return np.asarray(np.exp(np.clip(log_gain, -MAX_LOG_GAIN, MAX_LOG_GAIN)))
-
-
-# --------------------------------------------------------------------------------------------------
-# Weak priors on the colours of surface points without water.
-
-DARK_SHARE, DARK_LEVEL, DARK_SIGMA = 0.02, 0.02, 0.2
-"""The darkest 2 % of the points are shadows, nearly black (dark channel, He et al. 2011). Weak, as
-sand has none: beta_a of six known waters is 9 % wrong with a sigma of 0.1, 7 % with 0.2 and 0.5."""
-BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA = 0.02, 1.0, 0.2
-"""Only the brightest 2 % of the points may be brighter than the camera's white (saturation)."""
-
-
-@dataclass(frozen=True)
-class Belief:
-    """How far the points' colours are from what is usual, whitened."""
-
-    residual: float
-    by_J: dict[int, Array] = field(default_factory=dict)
-    """Derivative [P] by the points' J, of the channels that it depends on."""
-
-
-def beliefs(
-    J: Array,  # [3, P]
-    config: WaterPriorsConfig,
-) -> list[Belief]:
-    """All that are switched on."""
-    found: list[Belief] = []
-    for c in range(3):
-        if config.dark_channel:
-            found.append(_rank(J, c, DARK_SHARE, DARK_LEVEL, DARK_SIGMA))
-        if config.saturation:
-            bright = _rank(J, c, 1.0 - BRIGHT_SHARE, BRIGHT_LEVEL, BRIGHT_SIGMA)
-            found += [bright] if bright.residual > 0.0 else []
-    return found
-
-
-def _rank(
-    J: Array,  # [3, P]
-    c: int,
-    share: float,
-    level: float,
-    sigma: float,
-) -> Belief:
-    """The point with ``share`` of the others below it, against the level that it should have."""
-    rank = int(share * (J.shape[1] - 1))
-    point = int(np.argpartition(J[c], rank)[rank])
-    by_J = np.zeros(J.shape[1])
-    by_J[point] = 1.0 / sigma
-    return Belief(float((J[c, point] - level) / sigma), {c: by_J})

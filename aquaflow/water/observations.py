@@ -43,6 +43,11 @@ class Observations:
     """[M, 2] where in the picture, each axis from -1 to 1."""
     positions: Array
     """[S, 3] world, map units; points from S on are open water."""
+    ray: Array | None = None
+    """[M, 3] unit, camera axes, where it is seen; None: not known, nor is the light of lamps but at
+    the camera."""
+    normal: Array | None = None
+    """[M, 3] unit, camera axes, of the surface."""
 
     @cached_property
     def region(self) -> Index:

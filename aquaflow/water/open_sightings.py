@@ -54,7 +54,19 @@ def with_open_water(
         colour=np.concatenate([seen.colour, *colours]),
         z=np.concatenate([seen.z, np.full(count, INFINITE * seen.median_range)]),
         xy=np.concatenate([seen.xy, *cells]),
+        ray=_appended(seen.ray, count),
+        normal=_appended(seen.normal, count),
     )
+
+
+def _appended(
+    directions: Array | None,  # [M, 3]
+    count: int,
+) -> Array | None:
+    """[M + count, 3]: no lamp reaches where open water is put, whatever its direction."""
+    if directions is None:
+        return None
+    return np.concatenate([directions, np.tile([0.0, 0.0, 1.0], (count, 1))])
 
 
 def open_area(

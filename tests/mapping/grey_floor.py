@@ -8,6 +8,8 @@ import torch
 from aquaflow.config import MappingConfig
 from aquaflow.mapping.gaussians import raw_colour
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import to_bytes
+from aquaflow.render.transfers import picture_out
 from aquaflow.water.white_balance import Rgb, WhiteBalance
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of
 
@@ -32,5 +34,10 @@ def mapped(choice: str = "camera", light: Rgb | None = None) -> Mapper:
         1.9, (0.4, 0.4, 0.4), (0.9, 1.0, 1.05) if light else CAST, 0.1
     )  # fmt: skip
     places = ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.1, 0.0))
-    mapper.views = [view_of(BLANK, pose(at), index) for index, at in enumerate(places)]
+    blank = [view_of(BLANK, pose(at), index) for index, at in enumerate(places)]
+    pictures = [to_bytes(picture_out(mapper.show(view).image)) for view in blank]
+    mapper.views = [
+        view_of(picture, pose(at), index)
+        for index, (picture, at) in enumerate(zip(pictures, places, strict=True))
+    ]
     return mapper

@@ -13,7 +13,13 @@ from aquaflow.dive.map_file import read_map_file, summarise_water, write_map_fil
 from aquaflow.dive.results import medium_json
 from aquaflow.mapping.appearance import choose, shown_tone
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import drawn_without_water, restored_gaussians
+from aquaflow.mapping.restoration import (
+    RESTORED,
+    drawn_without_water,
+    restored_gaussians,
+    restored_picture,
+    to_bytes,
+)
 from aquaflow.mapping.scene import RenderedMap
 from aquaflow.mapping.state import copy_map, deserialise, serialise
 from aquaflow.render.contract import radiance
@@ -25,7 +31,7 @@ from aquaflow.water.daylight import Depths
 from aquaflow.water.illuminant import LUMINANCE
 from aquaflow.water.tone import ShownTone, lightness
 from tests.mapping.grey_floor import CAST, mapped
-from tests.mapping.mapping_scenes import renderer
+from tests.mapping.mapping_scenes import CAMERA, renderer, view_of
 from tests.water.daylit import daylit_grey
 
 
@@ -205,3 +211,28 @@ def test_the_colours_of_a_copy_are_as_light_as_they_were_seen() -> None:
     plain = restored_gaussians(mapper.scene, J, mapper.views).numpy()
     np.testing.assert_allclose(copy.clear, copy.tone.of(plain), atol=1e-5)
     assert lightness(copy.clear).mean() > 1.1 * lightness(plain).mean()
+
+
+def test_pictures_are_as_light_as_they_were_seen_whose_detail_the_map_lacks() -> None:
+    mapper = mapped()
+    assert mapper.scene.balance is not None
+    dark = tuple(0.6 * gain for gain in CAST)
+    mapper.scene.balance = replace(mapper.scene.balance, gain=dark)
+    pattern = torch.rand(
+        (CAMERA.height, CAMERA.width, 1), generator=torch.Generator().manual_seed(2)
+    )
+    drawn = [mapper.show(view).image for view in mapper.views]
+    coarse = [image * (0.4 + 1.2 * pattern) for image in drawn]
+    mapper.views = [
+        view_of(to_bytes(picture_out(image)), view.T_wc, view.frame_index)
+        for image, view in zip(coarse, mapper.views, strict=True)
+    ]
+    tone = shown_tone(mapper)
+    seen, restored = [], []
+    for view in mapper.views:
+        picture = restored_picture(mapper.scene, view, mapper.show(view))
+        judged = picture_out(picture.confidence) > RESTORED
+        seen.append(lightness(picture_out(view.target()))[judged])
+        restored.append(lightness(tone.of(picture_out(picture.image)))[judged])
+    assert tone.exposure > 1.2
+    assert np.concatenate(restored).mean() == pytest.approx(np.concatenate(seen).mean(), abs=0.15)

@@ -41,7 +41,7 @@ def test_a_pixel_whose_range_is_unknown_gets_no_gaussian() -> None:
     rows, columns = torch.tensor([3, 4]), torch.tensor([5, 6])
     half = torch.full((48, 64), 0.5)
     colour = torch.full((48, 64, 3), 0.5)
-    new = new_gaussians(grey_view(), rows, columns, z, colour, half, half, InsertionConfig())
+    new = new_gaussians(grey_view(), rows, columns, z, colour, half, half, 1.0, InsertionConfig())
     assert {len(values) for values in new.values()} == {1}
     assert all(bool(torch.isfinite(values).all()) for values in new.values())
 

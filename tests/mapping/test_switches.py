@@ -94,11 +94,9 @@ def test_above_a_threshold_every_pixel_gets_a_gaussian_whatever_is_drawn() -> No
     allowed = torch.ones(10, 10, dtype=torch.bool)
     chosen = {}
     for selection in ("threshold", "random"):
-        config = InsertionConfig.model_validate(
-            {"selection": selection, "tau_a": 0.4, "density": 1}
-        )
+        config = InsertionConfig.model_validate({"selection": selection, "tau_a": 0.4})
         chosen[selection] = [
-            len(select(P, allowed, config, torch.Generator().manual_seed(seed))[0])
+            len(select(P, allowed, 1.0, config, torch.Generator().manual_seed(seed))[0])
             for seed in range(3)
         ]
     assert chosen["threshold"] == [int((P > 0.4).sum())] * 3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -10,8 +12,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior import homography
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, pixel_grid, sample
-from aquaflow.prior.flow_pair import FlowPair
+from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, FlowMatcher, ImageFlow, pixel_grid, sample
+from aquaflow.prior.flow_pair import FlowPair, best_flow
 from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,
@@ -210,3 +212,30 @@ def test_the_classical_prior_claims_no_metres_and_no_descriptors() -> None:
     pair = pair_of(*moved_pair(shift(2.0, 0.0)))
     assert pair.D_a is None
     assert pair.D_b is None
+
+
+def flow_by(dx: float, error: float, columns: int) -> ImageFlow:
+    """All pixels move by ``dx``, with the same forward-backward error; the first columns count."""
+    forward = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    forward[..., 0] = dx
+    valid = np.arange(WIDTH) < columns
+    return ImageFlow(
+        forward,
+        -forward,
+        np.full((HEIGHT, WIDTH), error, np.float32),
+        np.broadcast_to(valid, (HEIGHT, WIDTH)).copy(),
+    )
+
+
+@pytest.mark.parametrize("right_first", [True, False])
+def test_of_flows_a_tile_apart_the_surer_one_is_taken_though_it_matches_less(
+    right_first: bool,
+) -> None:
+    a = ClassicalPrior().encode(rgb(texture(0)[:HEIGHT, :WIDTH]), CAMERA)
+    right, a_tile_off = flow_by(24.0, 0.1, WIDTH // 4), flow_by(0.0, 0.7, WIDTH // 3)
+    found = iter([right, a_tile_off] if right_first else [a_tile_off, right])
+
+    def matcher(*_: Any) -> ImageFlow:
+        return next(found)
+
+    assert best_flow(cast(FlowMatcher, matcher), a, a, [None, None]) is right

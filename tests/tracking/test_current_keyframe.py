@@ -126,7 +126,19 @@ def test_a_place_that_has_keyframes_enough_gets_no_more() -> None:
         assert error_share(result.tracked, poses) < 0.005
         made[crowd] = [keyframe.frame_index for keyframe in result.store.keyframes]
     assert len(made[3]) < len(made[1000])
-    assert len([index for index in made[3] if index > 190]) <= 1
+    # Two where the camera goes further out than it was before.
+    assert len([index for index in made[3] if index > 190]) <= 2
+
+
+def test_a_camera_that_moves_backwards_leaves_its_keyframes_though_all_are_in_view() -> None:
+    poses = [pose((0.0, 0.0, 0.0), (0.0, 0.0, -0.06 * i)) for i in range(40)]
+    made = {}
+    for crowd in (1, 1000):
+        prior = told(poses)
+        result = run(prior.frames(SMALL), QUICK.model_copy(update={"crowd": crowd}), prior)
+        made[crowd] = [keyframe.frame_index for keyframe in result.store.keyframes]
+    assert made[1] == made[1000]
+    assert len(made[1]) > 3
 
 
 def test_a_crowded_place_is_not_searched_anew_at_every_frame() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
+from aquaflow.prior.flow_pair import FlowPair
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.pose.matcher import KeyframeMatcher, Visibility
 from aquaflow.tracking.wide_steps import WideSteps, keypoint_poses
@@ -161,6 +164,41 @@ def test_what_a_turn_has_just_brought_into_view_gets_its_depth_from_the_next_ste
     assert solved is not None
     assert shift_px(solved.estimate.T, T_wc.inverse()) < 3.0
     assert keyframe.pointmap.is_known(0.15).mean() > 0.1
+
+
+def test_a_turn_that_no_keypoint_shows_is_followed_where_the_motion_so_far_leads() -> None:
+    store, config = KeyframeStore(), TrackingConfig()
+    T_wc = pose((0.0, 0.45, 0.0), (0.25, 0.05, 0.0))
+    frame = PRIOR.encode(FLOOR.picture(T_wc), CAMERA)
+    frame.keypoints = Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+    at = CurrentKeyframe(keyframe_at(HERE, store, np.zeros((CAMERA.height, CAMERA.width), bool)))
+    at.motion = pose((0.0, 0.42, 0.0), (0.25, 0.05, 0.0)).inverse()
+    tracker = KeyframeTracker(PRIOR, store, config)
+    solved = tracker.place_after_turn(at, frame, CAMERA, None)
+    assert solved is not None
+    assert shift_px(solved.estimate.T, T_wc.inverse()) < 3.0
+
+
+@pytest.mark.parametrize(("confidence", "found"), [(0.05, True), (0.005, False)])
+def test_matches_that_agree_by_chance_give_no_depth_after_a_turn(
+    confidence: float, found: bool
+) -> None:
+    store, T_wc = KeyframeStore(), pose((0.0, 0.45, 0.0), (0.25, 0.05, 0.0))
+
+    def decode(*given: Any, **named: Any) -> FlowPair:
+        pair = PRIOR.decode(*given, **named)
+        pair.C = np.full_like(pair.C, confidence)
+        return pair
+
+    prior: Any = SimpleNamespace(decode=decode, encode=PRIOR.encode)
+    at = CurrentKeyframe(keyframe_at(HERE, store, np.zeros((CAMERA.height, CAMERA.width), bool)))
+    at.motion = T_wc.inverse()
+    tracker = KeyframeTracker(prior, store, TrackingConfig())
+    frame = PRIOR.encode(FLOOR.picture(T_wc), CAMERA)
+    rough = tracker.place(CurrentKeyframe(keyframe_at(HERE, store)), frame, CAMERA)
+    assert rough is not None
+    for solved in (None, replace(rough, known_share=0.01)):
+        assert (tracker.place_after_turn(at, frame, CAMERA, solved) is not None) == found
 
 
 def test_a_pose_from_the_rim_of_what_is_known_is_replaced_after_a_turn() -> None:

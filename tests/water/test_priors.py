@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
+from aquaflow.water.beliefs import BRIGHT_LEVEL, DARK_LEVEL, beliefs
 from aquaflow.water.estimation import cost, normal_equations, weights
-from aquaflow.water.model import BRIGHT_LEVEL, DARK_LEVEL, Model, WaterModel, beliefs
+from aquaflow.water.model import Model, WaterModel
 from tests.water.water_observations import B_RES, D, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False, "regions": False}

@@ -71,6 +71,27 @@ def test_range_and_place_are_those_of_the_patch() -> None:
         np.testing.assert_allclose(seen.xy[row], at, atol=0.02)
 
 
+def test_rays_and_normals_are_in_camera_axes_and_normals_face_the_camera() -> None:
+    seen = looked([wall_picture(centre) for centre in BACKING])
+    assert seen.ray is not None
+    assert seen.normal is not None
+    local = seen.positions[seen.point] - np.array(BACKING)[seen.view]
+    expected = local / np.linalg.norm(local, axis=1, keepdims=True)
+    np.testing.assert_allclose(seen.ray, expected, atol=1e-6)
+    np.testing.assert_allclose(seen.normal, np.tile([0.0, 0.0, -1.0], (len(seen.z), 1)), atol=0.02)
+
+
+def test_what_stands_out_of_a_surface_does_not_turn_its_normals() -> None:
+    bumped = []
+    for centre in BACKING:
+        z = ranges_of_the_wall(centre)
+        z[50:54, 76:80] *= 0.97
+        bumped.append(wall_picture(centre, ranges=z))
+    seen = looked(bumped)
+    assert seen.normal is not None
+    assert np.quantile(-seen.normal[:, 2], 0.05) > 0.995
+
+
 def test_observations_come_by_point_and_a_point_is_seen_once_in_a_view() -> None:
     seen = looked([wall_picture(centre) for centre in BACKING])
     assert (np.diff(seen.point) >= 0).all()

@@ -41,7 +41,7 @@ __all__ = ["FORMAT_VERSION", "build", "camera_of", "write_dive"]
 MARKER = "synth.yaml"
 """The file by which a folder is known to be a synthetic dive."""
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Of the files and of the generator: the same config gives the same dive within a version."""
 
 MIP_LEVELS = 6

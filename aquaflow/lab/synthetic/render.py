@@ -72,8 +72,8 @@ def render(
     bodies: Sequence[objects.Solid] = (),
     lamps: Lamps | None = None,
 ) -> RenderedView:
-    """Render with ``supersampling`` x ``supersampling`` rays per pixel; ``bodies`` move by
-    themselves, and are where they are now."""
+    """Render with ``supersampling`` x ``supersampling`` rays per pixel, more where a net's twine
+    needs them; ``bodies`` move by themselves, and are where they are now."""
     still = len(scene.shapes)
     scene = replace(scene, shapes=[*scene.shapes, *bodies])
     up = np.diag([1.0, 1.0, -1.0])
@@ -85,23 +85,24 @@ def render(
         np.empty((height, width, 3), np.float32),
         np.empty((height, width), np.bool_),
     )
-    rows = max(1, CHUNK_RAYS // (width * supersampling**2))
+    k = max(supersampling, _rays_for_twine(scene.shapes, camera, up @ centre))
+    rows = max(1, CHUNK_RAYS // (width * k**2))
     light = None
     if lamps is not None:
         light = LampLight.of_camera(lamps, medium, rotation, origin.numpy())
 
     def draw(top: int) -> None:
         part = slice(top, min(top + rows, height))
-        met = _ranges(scene, camera, rotation, origin, part, supersampling)
-        J = _trace(scene, camera, met, part, supersampling)
-        view.clean[part] = _pixel_mean(J, supersampling)
+        met = _ranges(scene, camera, rotation, origin, part, k)
+        J = _trace(scene, camera, met, part, k)
+        view.clean[part] = _pixel_mean(J, k)
         t, what = met[2:]
         if light is None:
             colours = medium.compose(J, t.reshape(J.shape[:2]).numpy())
         else:
             colours = _lit(scene, light, met, J)
-        view.water[part] = _pixel_mean(colours, supersampling)
-        if supersampling > 1:
+        view.water[part] = _pixel_mean(colours, k)
+        if k > 1:
             t, what = _ranges(scene, camera, rotation, origin, part, 1)[2:]
         view.range_m[part] = t.reshape(-1, width).numpy()
         view.moving[part] = what.reshape(-1, width).numpy() >= still
@@ -115,6 +116,17 @@ def render(
     finally:
         torch.set_num_threads(threads)
     return view
+
+
+def _rays_for_twine(shapes: Sequence[objects.Solid], camera: CameraModel, centre: Array) -> int:
+    """Rays along a pixel's side that are no further apart, on any net straight ahead, than its
+    twine is thick: fewer hit twine here and there by chance, and what a picture then shows is a
+    pattern that no camera sees and that moves unlike the net."""
+    count = 1
+    for net in (shape for shape in shapes if shape.kind == "net"):
+        distance = abs(float(net.R[:, 2] @ (centre - net.centre)))
+        count = max(count, math.ceil(distance / (camera.fx * net.twine_m)))
+    return count
 
 
 def _pixel_mean(

@@ -65,6 +65,15 @@ def test_one_sees_through_a_net_to_open_water(tmp_path: Path) -> None:
         assert np.abs(np.diff(twine[row].astype(int))).sum() > 20
 
 
+def test_a_small_picture_shows_a_net_as_a_sharper_one_does(tmp_path: Path) -> None:
+    """Twine thinner than a pixel is a part of it, not all of it here and nothing there."""
+    quiet = {"scene": "net", "snow_per_m3": 0.0, "noise_sigma": 0.0}
+    sharper = {**quiet, "width": 480, "height": 360, "supersampling": 3}
+    small, sharp = written(tmp_path / "small", **quiet), written(tmp_path / "sharp", **sharper)
+    mean = sharp.clean(1).reshape(90, 4, 120, 4, 3).mean(axis=(1, 3))
+    assert np.corrcoef(small.clean(1).ravel(), mean.ravel())[0, 1] > 0.7
+
+
 @pytest.mark.parametrize("scene", ["hull", "net"])
 def test_a_vehicle_before_a_hull_or_a_net_faces_it(scene: str) -> None:
     with pytest.raises(ValidationError, match=f"a vehicle at a {scene} faces it"):

@@ -13,6 +13,7 @@ from aquaflow.mapping.gaussians import (
     COVERED_ALPHA,
     MAX_SPACING_WIDTHS,
     SCALE_OF_SPACING,
+    density_for,
     insertion_probability,
     new_gaussians,
     select,
@@ -40,6 +41,7 @@ def born(
     z: torch.Tensor,
     P: float = 0.5,
     confidence: float = 1.0,
+    density: float = 1.0,
     **keys: float,
 ) -> dict[str, torch.Tensor]:
     image = np.zeros((*SIZE, 3), np.uint8)
@@ -52,6 +54,7 @@ def born(
         EDGE,
         torch.full(SIZE, confidence),
         torch.full(SIZE, P),
+        density,
         InsertionConfig.model_validate(keys),
     )
 
@@ -95,17 +98,23 @@ def test_structure_saturates_at_one_and_is_never_negative() -> None:
 
 
 def test_a_probability_at_tau_a_is_not_selected() -> None:
-    config = InsertionConfig(tau_a=0.3, density=1.0)
+    config = InsertionConfig(tau_a=0.3)
     at = torch.full(SIZE, 0.3)
-    assert len(select(at, torch.ones(SIZE, dtype=torch.bool), config, random())[0]) == 0
-    above = torch.ones(SIZE)
-    assert len(select(above, torch.ones(SIZE, dtype=torch.bool), config, random())[0]) == 64 * 48
+    assert len(select(at, torch.ones(SIZE, dtype=torch.bool), 1.0, config, random())[0]) == 0
+    above, allowed = torch.ones(SIZE), torch.ones(SIZE, dtype=torch.bool)
+    assert len(select(above, allowed, 1.0, config, random())[0]) == 64 * 48
+
+
+def test_an_empty_map_is_filled_densely_and_a_full_one_as_the_paper_does() -> None:
+    densities = [density_for(5.0, filled) for filled in (0.0, 0.4, 0.8, 0.95, 1.0)]
+    assert densities == pytest.approx([5.0, 3.0, 1.0, 1.0, 1.0])
+    assert {density_for(0.5, filled) for filled in (0.0, 0.6, 1.0)} == {0.5}
 
 
 def test_only_allowed_pixels_are_selected() -> None:
     allowed = torch.zeros(SIZE, dtype=torch.bool)
     allowed[10:20, 5:9] = True
-    rows, columns = select(torch.ones(SIZE), allowed, InsertionConfig(density=1.0), random())
+    rows, columns = select(torch.ones(SIZE), allowed, 1.0, InsertionConfig(), random())
     assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [
         (row, column) for row in range(10, 20) for column in range(5, 9)
     ]
@@ -113,7 +122,7 @@ def test_only_allowed_pixels_are_selected() -> None:
 
 def test_pixels_are_drawn_with_probability_times_density() -> None:
     everywhere = torch.ones(200, 200, dtype=torch.bool)
-    chosen = select(torch.full((200, 200), 0.4), everywhere, InsertionConfig(density=0.5), random())
+    chosen = select(torch.full((200, 200), 0.4), everywhere, 0.5, InsertionConfig(), random())
     assert len(chosen[0]) == pytest.approx(0.2 * 40_000, abs=5 * math.sqrt(0.16 * 40_000))
 
 
