@@ -54,12 +54,12 @@ def with_open_water(
         colour=np.concatenate([seen.colour, *colours]),
         z=np.concatenate([seen.z, np.full(count, INFINITE * seen.median_range)]),
         xy=np.concatenate([seen.xy, *cells]),
-        ray=_appended(seen.ray, count),
-        normal=_appended(seen.normal, count),
+        ray=_append(seen.ray, count),
+        normal=_append(seen.normal, count),
     )
 
 
-def _appended(
+def _append(
     directions: Array | None,  # [M, 3]
     count: int,
 ) -> Array | None:

@@ -38,7 +38,7 @@ STEPS = 8
 
 
 @dataclass(frozen=True)
-class LampLight:
+class SyntheticLampLight:
     """The lamps of a vehicle in one water, where they are now; in any frame, m."""
 
     lamps: Lamps
@@ -55,7 +55,7 @@ class LampLight:
         medium: Medium,
         R: Array,  # [3, 3] camera axes in the frame
         centre: Array,  # [3] m, of the camera in the frame
-    ) -> LampLight:
+    ) -> SyntheticLampLight:
         """The lamps as they are mounted around a camera."""
         places = centre + np.asarray(lamps.places_m) @ R.T
         return cls(lamps, medium, places.astype(np.float32), R[:, 2].astype(np.float32))

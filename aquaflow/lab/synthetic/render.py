@@ -17,7 +17,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import rays_of_pixels
 from aquaflow.lab.synthetic import objects
 from aquaflow.lab.synthetic.config import Lamps
-from aquaflow.lab.synthetic.lamps import LampLight
+from aquaflow.lab.synthetic.lamps import SyntheticLampLight
 from aquaflow.lab.synthetic.march import RayHeightField
 from aquaflow.lab.synthetic.radiance import TEXELS_PER_CELL
 from aquaflow.lab.synthetic.relief import Area
@@ -89,7 +89,7 @@ def render(
     rows = max(1, CHUNK_RAYS // (width * k**2))
     light = None
     if lamps is not None:
-        light = LampLight.of_camera(lamps, medium, rotation, origin.numpy())
+        light = SyntheticLampLight.of_camera(lamps, medium, rotation, origin.numpy())
 
     def draw(top: int) -> None:
         part = slice(top, min(top + rows, height))
@@ -247,7 +247,7 @@ def _trace(
 
 def _lit(
     scene: SyntheticScene,
-    light: LampLight,
+    light: SyntheticLampLight,
     met: Met,  # of N rays: [3] or [3, N], [3, N], [N], [N]
     J: npt.NDArray[np.float32],  # [k R, k W, 3]
 ) -> npt.NDArray[np.floating]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import pixels_of_points
 from aquaflow.lab.synthetic.config import Lamps, SyntheticConfig
-from aquaflow.lab.synthetic.lamps import LampLight
+from aquaflow.lab.synthetic.lamps import SyntheticLampLight
 from aquaflow.lab.synthetic.water import Medium
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -56,7 +56,9 @@ class Snow:
     ) -> None:
         """Blend the particles that are in view over ``image``."""
         light = (
-            None if lamps is None else LampLight.of_camera(lamps, medium, np.eye(3), np.zeros(3))
+            None
+            if lamps is None
+            else SyntheticLampLight.of_camera(lamps, medium, np.eye(3), np.zeros(3))
         )
         local = (self._position + CURRENT_M_S * t_s - centre) @ R_sc
         distance = np.linalg.norm(local, axis=1)
@@ -102,7 +104,7 @@ def _lit(
     place: Array,  # [3] m, camera axes
     distance: float,
     medium: Medium,
-    light: LampLight | None,  # in camera axes
+    light: SyntheticLampLight | None,  # in camera axes
 ) -> Array:
     """[3] a particle as it reaches the camera."""
     J, t = np.full((1, 3), SNOW_ALBEDO), np.array([distance])

@@ -9,7 +9,12 @@ from scipy.integrate import quad
 
 from aquaflow.lab.synthetic.config import Lamps, SyntheticConfig
 from aquaflow.lab.synthetic.dive import write_dive
-from aquaflow.lab.synthetic.lamps import BACKWARD_PER_SR, NEAREST_M, SCATTERED_SHARE, LampLight
+from aquaflow.lab.synthetic.lamps import (
+    BACKWARD_PER_SR,
+    NEAREST_M,
+    SCATTERED_SHARE,
+    SyntheticLampLight,
+)
 from aquaflow.lab.synthetic.truth import read_truth
 from aquaflow.lab.synthetic.water import WATER_TYPES, Medium
 
@@ -18,11 +23,11 @@ AHEAD = np.array([[0.0, 0.0, 1.0]])
 CLEAR = WATER_TYPES["clear"]
 
 
-def _light(lamps: Lamps, medium: Medium = CLEAR) -> LampLight:
-    return LampLight.of_camera(lamps, medium, np.eye(3), np.zeros(3))
+def _light(lamps: Lamps, medium: Medium = CLEAR) -> SyntheticLampLight:
+    return SyntheticLampLight.of_camera(lamps, medium, np.eye(3), np.zeros(3))
 
 
-def _seen(light: LampLight, distance: float, J: float = 0.5) -> np.ndarray:
+def _seen(light: SyntheticLampLight, distance: float, J: float = 0.5) -> np.ndarray:
     """[3] a surface ahead that faces the camera."""
     t = np.array([distance])
     return light.compose(np.full((1, 3), J), np.zeros(3), AHEAD, t, -AHEAD)[0]
