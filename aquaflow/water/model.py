@@ -47,6 +47,10 @@ evenly from one side to the other."""
 SHADING_SIGMA = np.array([0.04, 0.04, 0.3, 0.04, 0.3])
 """Prior: log-gain at the edge of the picture, by term; a third is a strong lamp fall-off, and both
 lamp and lens are on the whole alike on all sides."""
+BRIGHTER_SIGMA = 0.02
+"""Prior: the same where an even term would make the edge brighter: no lens does, and what a camera
+corrects too far is a few per cent. Left free, 0.17 to 0.5 take the water's place on IUI3
+(notes/2026-11-water.md#brighter)."""
 EXPOSURE_SIGMA = 0.01, 0.5
 """Prior: log-gain of a view against the mean of all, its least and its largest sigma; what it is
 between them, the views' own gains say (empirical Bayes). Two stops span a dive's auto-exposure. One
@@ -305,7 +309,12 @@ class WaterUnknowns:
         x: Array,  # [K] parameters
     ) -> tuple[Array, Array]:
         """Whitened residuals [R] of the linear priors, and their derivatives [R, K]."""
-        return self._rows @ (x - self.start), self._rows
+        rows = self._rows
+        if self.model.shading:
+            brighter = self.shading.start + EVEN[x[self.shading][EVEN] > 0.0]
+            rows = rows.copy()
+            rows[brighter, brighter] = 1.0 / BRIGHTER_SIGMA
+        return rows @ (x - self.start), rows
 
     def _prior_rows(self, exposure: float, tint: float) -> Array:
         """[R, K]; sigmas of the views' log-gains."""
@@ -341,6 +350,8 @@ class WaterUnknowns:
 
 TERMS = 5
 """x, y, x^2, x y and y^2: vignetting and a lamp at the side; a constant would be exposure."""
+EVEN = np.array([2, 4])
+"""x^2 and y^2 among them."""
 """Guards the exponential: a picture seven times darker at its edge shows nothing there anyway."""
 
 

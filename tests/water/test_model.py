@@ -105,6 +105,15 @@ def test_exposures_are_expected_to_differ_by_as_much_as_they_do() -> None:
     assert WaterModel(problem.seen, Model(), B_RES, D).expecting(x[:0]).size == 0
 
 
+def test_a_lens_may_darken_the_edge_of_its_picture_but_hardly_brighten_it() -> None:
+    problem, _ = exact(Model(shading=True))
+    for term in (2, 4):  # x^2, y^2
+        edge = 0.3 * (np.arange(problem.size) == problem.shading.start + term)
+        darker, brighter = (np.linalg.norm(problem.priors(sign * edge)[0]) for sign in (-1, 1))
+        assert darker == pytest.approx(1.0)
+        assert brighter == pytest.approx(15.0)
+
+
 def test_the_priors_derivatives_are_those_of_the_priors() -> None:
     problem, x = exact(EVERY[-1])
     _, rows = problem.priors(x)
