@@ -242,6 +242,12 @@ class Pointmap:
         known = (self.rho > 1e-6) & (self.variance < UNKNOWN_VARIANCE)
         return np.where(known, self.rho**2 / np.maximum(self.variance, 1e-12), 0.0)
 
+    def points(self) -> Array:
+        """[H, W, 3] pointmap in the camera frame; NaN where unknown."""
+        rays = self.camera.unproject(self.camera.pixel_centres())
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.rho[..., None] > 1e-6, rays / self.rho[..., None], np.nan)
+
     def copy(self) -> Pointmap:
         """A copy with arrays of its own; learned depths are never changed in place."""
         return replace(self, rho=self.rho.copy(), variance=self.variance.copy())

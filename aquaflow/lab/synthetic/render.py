@@ -118,7 +118,11 @@ def render(
     return view
 
 
-def _rays_for_twine(shapes: Sequence[objects.Solid], camera: CameraModel, centre: Array) -> int:
+def _rays_for_twine(
+    shapes: Sequence[objects.Solid],
+    camera: CameraModel,
+    centre: Array,  # [3] of the camera, m
+) -> int:
     """Rays along a pixel's side that are no further apart, on any net straight ahead, than its
     twine is thick: fewer hit twine here and there by chance, and what a picture then shows is a
     pattern that no camera sees and that moves unlike the net."""

@@ -60,7 +60,7 @@ STAGES: list[tuple[type | ModuleType, str, int, str]] = [
     (FrameGate, "judge", 4, "frame gate"),
     (ClassicalPrior, "encode", 7, "encoding"),
     (Initialiser, "solve", 1, "initialisation"),
-    (KeyframeTracker, "place", 16, "pose"),
+    (KeyframeTracker, "place", 17, "pose"),
     (Places, "of_frame", 1, "relocalisation"),
     (KeyframeGraph, "close_loops", 1, "loop search"),
     (Places, "add", 2, "place index"),
