@@ -127,7 +127,7 @@ class InsertionConfig(StageConfig):
         gt=0,
         le=100,
         description="Gaussians per pixel for each unit of structure in an empty map, at most one "
-        "in a pixel; falls to 1 as the map fills (notes/2026-11-mapping.md#density)",
+        "in a pixel; falls to 1 as the map fills (notes/2026-11-mapping.md#density-with-room)",
     )
     bare_probability: Lab[float] = Field(
         0.06, ge=0, le=1, description="least P_a where the map does not cover the picture"

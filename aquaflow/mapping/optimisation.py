@@ -362,11 +362,7 @@ SLACK = 0.1
 """Share of the time that the steps may be behind before they are hurried."""
 
 
-def share_done(
-    step: int,
-    steps: int,
-    passed: float,
-) -> float:
+def share_done(step: int, steps: int, passed: float) -> float:
     """Share of the refinement that is done at ``step`` of ``steps``, when the share ``passed`` of
     the time is over: that of the steps, as long as the time will do for them, so that the same
     dive gives the same bytes; else that of the time."""

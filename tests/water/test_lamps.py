@@ -13,7 +13,14 @@ from aquaflow.water.estimation import EVERY_MODEL, Model, WaterModel, with_lamp
 from aquaflow.water.medium import WaterParameters
 from aquaflow.water.model import Lamp, Trial
 from aquaflow.water.observations import Observations
-from tests.water.water_observations import B_RES, BETA, D, fitted, sighted
+from tests.water.water_observations import (
+    B_RES,
+    BETA,
+    D,
+    assert_derivatives_are_finite_differences,
+    fitted,
+    sighted,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -75,16 +82,4 @@ def test_lamps_take_water_and_are_looked_for_in_even_backscatter() -> None:
 def test_derivatives_by_a_lamp_are_those_of_finite_differences(c: int) -> None:
     seen = lit(sighted(points=60))
     problem = WaterModel(seen, Model(water=True, shading=True, lamp=True), B_RES, D)
-    rng = np.random.default_rng(0)
-    x = problem.start + 0.1 * rng.normal(size=problem.size)
-    J = problem.predict(x).J
-
-    def errors(at: Array) -> Array:
-        now = problem.predict(at)
-        return now.a[c] * J[c, seen.point] + now.backscatter[c] - seen.colour[:, c]
-
-    found = problem.derivatives(problem.predict(x), np.ones(len(seen.z)), c)
-    for k, row in zip(found.own, found.direct, strict=True):
-        step = np.zeros(problem.size)
-        step[k] = 1e-6
-        np.testing.assert_allclose(row, (errors(x + step) - errors(x - step)) / 2e-6, atol=1e-6)
+    assert_derivatives_are_finite_differences(problem, c, spread=0.1)

@@ -11,7 +11,14 @@ import pytest
 from aquaflow.water.model import Lamp, Model, Trial, WaterModel
 from aquaflow.water.mounting import START, MountedLight
 from aquaflow.water.observations import Observations
-from tests.water.water_observations import B_RES, BETA, D, fitted, sighted
+from tests.water.water_observations import (
+    B_RES,
+    BETA,
+    D,
+    assert_derivatives_are_finite_differences,
+    fitted,
+    sighted,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -95,16 +102,4 @@ def test_by_lamps_what_is_brighter_than_white_is_no_evidence_against_the_water()
 def test_derivatives_by_the_mounting_are_those_of_finite_differences(c: int) -> None:
     seen = on_sloping_ground(60)
     problem = WaterModel(seen, Model(water=True, shading=True, lamp=True), B_RES, D)
-    rng = np.random.default_rng(0)
-    x = problem.start + 0.05 * rng.normal(size=problem.size)
-    J = problem.predict(x).J
-
-    def errors(at: Array) -> Array:
-        now = problem.predict(at)
-        return np.asarray(now.a[c] * J[c, seen.point] + now.backscatter[c] - seen.colour[:, c])
-
-    found = problem.derivatives(problem.predict(x), np.ones(len(seen.z)), c)
-    for k, row in zip(found.own, found.direct, strict=True):
-        step = np.zeros(problem.size)
-        step[k] = 1e-6
-        np.testing.assert_allclose(row, (errors(x + step) - errors(x - step)) / 2e-6, atol=1e-6)
+    assert_derivatives_are_finite_differences(problem, c, spread=0.05)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.water.estimation import EVERY_MODEL, WaterEstimate, estimating
-from aquaflow.water.model import BELIEVED, Model, shading_basis
+from aquaflow.water.model import BELIEVED, Model, WaterModel, shading_basis
 from aquaflow.water.observations import Observations, run_to_end
 
 Array = npt.NDArray[np.float64]
@@ -67,3 +67,20 @@ def fitted(seen: Observations) -> WaterEstimate:
     estimate = estimate_water(seen, B_RES, D)
     assert estimate is not None
     return estimate
+
+
+def assert_derivatives_are_finite_differences(problem: WaterModel, c: int, spread: float) -> None:
+    """Of channel ``c``, around parameters drawn ``spread`` from the start, at their J."""
+    rng, seen = np.random.default_rng(0), problem.seen
+    x = problem.start + spread * rng.normal(size=problem.size)
+    J = problem.predict(x).J
+
+    def errors(at: Array) -> Array:
+        now = problem.predict(at)
+        return np.asarray(now.a[c] * J[c, seen.point] + now.backscatter[c] - seen.colour[:, c])
+
+    found = problem.derivatives(problem.predict(x), np.ones(len(seen.z)), c)
+    for k, row in zip(found.own, found.direct, strict=True):
+        step = np.zeros(problem.size)
+        step[k] = 1e-6
+        np.testing.assert_allclose(row, (errors(x + step) - errors(x - step)) / 2e-6, atol=1e-6)
