@@ -154,7 +154,7 @@ def test_reasons_that_differ_in_numbers_are_one_and_rare_ones_are_summed() -> No
 
 def texts_of(pdf: bytes) -> int:
     """Streams of the file that decompress: every page and picture of a sound file."""
-    streams = re.findall(rb"FlateDecode.*?stream\r?\n(.*?)\r?\nendstream", pdf, re.DOTALL)
+    streams = re.findall(rb"FlateDecode.*?stream\r?\n(.*?)\nendstream", pdf, re.DOTALL)
     return sum(bool(zlib.decompress(each)) for each in streams)
 
 
