@@ -155,7 +155,7 @@ def load_map(
 
     Args:
         path: a folder stands for its ``map.aqf``, the largest sub-map.
-        renderer: ``auto`` takes the GPU where gsplat and CUDA are there, else the CPU kernels.
+        renderer: ``auto`` takes the fastest that draws here, on a GPU or the processor.
         threads: of the CPU kernels; as many as torch has if None.
 
     Raises:

@@ -279,7 +279,7 @@ class MappingConfig(StageConfig):
     """The map (paper, Sec. 3.3 and 3.4)."""
 
     enabled: bool = Field(True, description="False: trajectory only")
-    renderer: Literal["auto", "cpu", "tiles", "gsplat"] = "auto"
+    renderer: Literal["auto", "cpu", "tiles", "gsplat", "wgpu"] = "auto"
     max_gaussians: int = Field(150_000, ge=1000, description="hard cap")
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"

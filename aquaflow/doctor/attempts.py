@@ -41,6 +41,8 @@ class Attempt:
     figures: Figures = field(default_factory=dict)
     failed: str = ""
     """Why, in one sentence; empty if it did not."""
+    adapters: tuple[str, ...] = ()
+    """Those that wgpu finds, the one that was tried first; of other attempts none."""
 
 
 def apart(name: str, command: tuple[str, ...] = (), limit_s: float = LIMIT_S) -> Attempt:
@@ -53,7 +55,8 @@ def apart(name: str, command: tuple[str, ...] = (), limit_s: float = LIMIT_S) ->
     if ran.returncode != 0:
         said = (ran.stderr.strip().splitlines() or ["it said nothing"])[-1]
         return Attempt(failed=f"it crashed ({_ending(ran.returncode)}): {said}")
-    return Attempt(**json.loads(ran.stdout.strip().splitlines()[-1]))
+    said = json.loads(ran.stdout.strip().splitlines()[-1])
+    return Attempt(**{**said, "adapters": tuple(said.get("adapters", ()))})
 
 
 def _ending(status: int) -> str:
@@ -82,13 +85,35 @@ def draw(make: Callable[[], Renderer] | None = None) -> Figures:
     except RuntimeError as error:  # torch's for everything that a GPU cannot do
         raise AquaFlowError(_failure("gsplat", error)) from error
     if (reason := too_far(found)) is not None:
-        raise AquaFlowError(f"gsplat draws wrongly here: {reason}; set mapping.renderer: cpu")
+        name = renderer.name
+        raise AquaFlowError(f"{name} draws wrongly here: {reason}; set mapping.renderer: cpu")
     picture = found.pop(PICTURE)
     return {
         **_durations(*times),
         "difference_picture": picture,
         "difference_gradients": max(found.values()),
     }
+
+
+def draw_on_adapter() -> Figures:
+    """The same by wgpu.
+
+    Raises:
+        AquaFlowError: as :func:`draw`; or the adapter failed, and the processor drew.
+    """
+    from aquaflow.render.webgpu import WgpuRenderer
+
+    renderer = WgpuRenderer()
+    figures = draw(lambda: renderer)
+    if (reason := renderer.failed) is not None:
+        raise AquaFlowError(f"{reason}; update its driver, or set mapping.renderer: cpu")
+    return figures
+
+
+def _adapters() -> tuple[str, ...]:
+    from aquaflow.render.webgpu_device import find_adapters
+
+    return tuple(str(adapter) for adapter, _ in find_adapters())
 
 
 def _check_torch(renderer: Renderer) -> None:
@@ -150,6 +175,7 @@ def _durations(began: float, first: float, second: float) -> Figures:
 
 ATTEMPTS: dict[str, Callable[[], Figures]] = {
     "gsplat": draw,
+    "wgpu": draw_on_adapter,
     "cuda": partial(infer, "cuda"),
     "tensorrt": partial(infer, "tensorrt"),
 }
@@ -160,7 +186,8 @@ def main() -> None:
     """Answer one attempt."""
     with redirect_stdout(sys.stderr):
         try:
-            outcome = Attempt(ATTEMPTS[sys.argv[1]]())
+            name = sys.argv[1]
+            outcome = Attempt(ATTEMPTS[name](), adapters=_adapters() if name == "wgpu" else ())
         except AquaFlowError as error:
             outcome = Attempt(failed=str(error))
     print(json.dumps(asdict(outcome)))

@@ -171,6 +171,7 @@ PACKAGES = (
     Package("onnxruntime", "onnxruntime", "prior", "learned priors"),
     Package("kornia", "kornia", "prior-peers", "the priors xfeat and aliked"),
     Package("gsplat", "gsplat", "gpu", "maps on a GPU with CUDA"),
+    Package("wgpu", "wgpu", "gpu-any", "maps on a GPU of any maker"),
     Package("onnx", "onnx", "export", "exporting a trained prior"),
     Package("onnxscript", "onnxscript", "export", "exporting a trained prior"),
     Package("pycolmap", "pycolmap", "peers", "COLMAP beside AquaFlow in `aquaflow lab bench`"),

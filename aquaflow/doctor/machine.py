@@ -133,6 +133,8 @@ class MachineProbes:
 
 CUDA, TENSORRT = "CUDAExecutionProvider", "TensorrtExecutionProvider"
 """onnxruntime's names."""
+SOFTWARE = "(CPU, "
+"""In the words for an adapter that is a program; see render/webgpu_device.py."""
 
 
 def findings(machine: MachineProbes) -> list[CheckResult]:
@@ -142,8 +144,10 @@ def findings(machine: MachineProbes) -> list[CheckResult]:
     """
     gpu = machine.gpu()
     providers = machine.onnx_providers()
+    any_gpu = [_webgpu(machine)] if machine.module_present("wgpu") else []
     if isinstance(gpu, str):
-        return [_absent(machine, gpu), *([_cuda(machine)] if CUDA in providers else [])]
+        cuda = [_cuda(machine)] if CUDA in providers else []
+        return [_absent(machine, gpu, bool(any_gpu)), *any_gpu, *cuda]
     driver = machine.driver()
     found = f"{gpu}{f', driver {driver}' if driver else ''}"
     return [
@@ -151,13 +155,17 @@ def findings(machine: MachineProbes) -> list[CheckResult]:
             "GPU", found, "tracking runs on the processor; the map and learned priors: below"
         ),
         _gsplat(machine),
+        *any_gpu,
         _cuda(machine),
         *([_tensorrt(machine)] if TENSORRT in providers else []),
     ]
 
 
-def _absent(machine: MachineProbes, reason: str) -> CheckResult:
+def _absent(machine: MachineProbes, reason: str, others: bool) -> CheckResult:
+    """torch reaches no GPU; ``others`` are for wgpu to find."""
     if not (machine.which("nvidia-smi") or machine.driver()):
+        if others:
+            return CheckResult("GPU", "none with CUDA", "learned priors run on the processor")
         return CheckResult("GPU", "none", "everything runs on the processor")
     return CheckResult(
         "GPU",
@@ -173,12 +181,32 @@ def _gsplat(machine: MachineProbes) -> CheckResult:
         return CheckResult(
             "gsplat", "does not draw", "maps are drawn on the processor", tried.failed
         )
-    found = (
-        f"drew a known scene and its gradients, {_times(tried.figures)}; the picture is "
-        f"{tried.figures['difference_picture']:.1e} of full scale from the reference's, the "
-        f"gradients {tried.figures['difference_gradients']:.1e}"
-    )
+    found = _drew(tried.figures)
     return CheckResult("gsplat", found, "maps are optimised on the GPU", figures=tried.figures)
+
+
+def _webgpu(machine: MachineProbes) -> CheckResult:
+    """Every maker's GPU; a program that stands in for one is no shortcoming, and not used."""
+    tried = machine.attempt("wgpu")
+    if tried.failed:
+        return CheckResult(
+            "WebGPU", "does not draw", "maps are drawn on the processor", tried.failed
+        )
+    taken, *others = tried.adapters
+    found = f"{taken} {_drew(tried.figures)}{''.join(f'; also {each}' for each in others)}"
+    if SOFTWARE in taken:
+        used = "maps are drawn on the processor: this is a program, and slower"
+    else:
+        used = "maps are drawn on it where that is the fastest"
+    return CheckResult("WebGPU", found, used, figures=tried.figures)
+
+
+def _drew(figures: Figures) -> str:
+    return (
+        f"drew a known scene and its gradients, {_times(figures)}; the picture is "
+        f"{figures['difference_picture']:.1e} of full scale from the reference's, the "
+        f"gradients {figures['difference_gradients']:.1e}"
+    )
 
 
 def _cuda(machine: MachineProbes) -> CheckResult:

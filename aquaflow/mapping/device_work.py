@@ -21,8 +21,8 @@ from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import Facts, deserialise, serialise
-from aquaflow.render import cpu_renderer
 from aquaflow.render.contract import Renderer
+from aquaflow.render.cpu import cpu_renderer
 from aquaflow.render.gsplat import give_back_after
 
 # --------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from collections import deque
 from dataclasses import dataclass
@@ -15,13 +16,14 @@ from torch.utils.checkpoint import checkpoint
 from aquaflow.render.contract import (
     CPU,
     TILE_PX,
+    Renderer,
     Rendering,
     check_devices,
     check_inputs,
     tile_box,
     tile_grid,
 )
-from aquaflow.render.library import STAGES, Library, load_library
+from aquaflow.render.library import STAGES, Library, NativeUnavailableError, load_library
 from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
 from aquaflow.render.tensor_address import pointer
 
@@ -321,3 +323,18 @@ def _draw_batch(
     faint = torch.zeros((), dtype=opacity.dtype, device=opacity.device)
     alpha = alpha_at(offset, conic[slots], torch.where(filled, opacity[slots], faint))
     return torch.einsum("tlp,tlc->tpc", blend_weights(alpha, 1), layers[slots])
+
+
+def cpu_renderer(threads: int | None = None, may_fall_back: bool = True) -> Renderer:
+    """The CPU's renderer: compiled kernels, else, if it ``may_fall_back``, torch's tiles."""
+    try:
+        return CpuRenderer(threads)
+    except NativeUnavailableError as error:
+        if not may_fall_back:
+            raise
+        warnings.warn(
+            f"{error} Drawing with the torch tile renderer instead, hundreds of times slower.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return TileRenderer(threads)

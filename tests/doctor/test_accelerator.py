@@ -47,6 +47,7 @@ def found_on(
         gpu=lambda: gpu,
         onnx_providers=lambda: providers,
         attempt=attempt,
+        module_present=lambda name: name in attempts,
     )
     found = {finding.name: finding for finding in accelerator.findings(machine)}
     assert len(tried) == len(found) - 1
@@ -84,6 +85,29 @@ def test_what_failed_says_why_and_what_is_used_instead(
     assert found[name].advice == "no kernels; compile them"
     assert found[name].figures == {}
     assert [each.name for each in found.values() if not each.ok] == [name]
+
+
+LAVAPIPE = "llvmpipe (CPU, Vulkan, Mesa 22.3.6)"
+RADEON = "AMD Radeon 780M (IntegratedGPU, Vulkan, radv)"
+
+
+def test_every_makers_gpu_is_tried_where_wgpu_is_installed() -> None:
+    found = found_on("no CUDA", CPU_ONLY, False, wgpu=replace(DREW, adapters=(RADEON, LAVAPIPE)))
+    assert list(found) == ["GPU", "WebGPU"]
+    assert found["WebGPU"].ok
+    assert found["WebGPU"].found.startswith(f"{RADEON} drew a known scene and its gradients")
+    assert found["WebGPU"].found.endswith(f"; also {LAVAPIPE}")
+    assert found["WebGPU"].used_for == "maps are drawn on it where that is the fastest"
+
+
+def test_a_program_that_stands_in_for_a_gpu_is_said_to_be_one() -> None:
+    found = found_on("no CUDA", CPU_ONLY, False, wgpu=replace(DREW, adapters=(LAVAPIPE,)))
+    assert "this is a program, and slower" in found["WebGPU"].used_for
+    failed = found_on("no CUDA", CPU_ONLY, False, wgpu=Attempt(failed="it has no driver"))
+    assert (failed["WebGPU"].found, failed["WebGPU"].advice) == (
+        "does not draw",
+        "it has no driver",
+    )
 
 
 def test_tensorrt_that_does_not_run_is_no_shortcoming_where_cuda_runs() -> None:
@@ -131,7 +155,11 @@ def test_the_drivers_version_is_in_the_report(tmp_path) -> None:
     file.parent.mkdir(parents=True)
     file.write_text("NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.159.03  Tue Jan 6\n")
     machine = MachineProbes(
-        root=tmp_path, gpu=lambda: ORIN, onnx_providers=list, attempt=GOOD.__getitem__
+        root=tmp_path,
+        gpu=lambda: ORIN,
+        onnx_providers=list,
+        attempt=GOOD.__getitem__,
+        module_present=lambda _: False,
     )
     assert accelerator.findings(machine)[0].found.endswith("CUDA 12.6, driver 580.159.03")
     silent = replace(machine, root=tmp_path / "other", which=lambda name: None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from dataclasses import replace
@@ -27,6 +28,7 @@ from aquaflow.render.reference import ReferenceRenderer
 from tests.device.device_scenes import SinglePrecision
 from tests.pretended_device import PRETENDED, pretended_device
 from tests.prior.pretended_gpu import PretendedGpu
+from tests.render.render_scenes import needs_adapter
 
 ORIN = Gpu("Orin", "8.7", 7.4, "2.8.0", "12.6", ("sm_80", "sm_90"))
 NO_IMAGE = "CUDA error: no kernel image is available for execution on the device\nlong advice"
@@ -81,7 +83,7 @@ def test_a_scene_is_drawn_on_the_device_and_compared_on_the_cpu() -> None:
 
 def test_a_renderer_that_draws_wrongly_is_not_to_be_used() -> None:
     said = refusal(draw, lambda: Faulty(lambda image: 1.05 * image))
-    assert said.startswith("gsplat draws wrongly here: its picture is ")
+    assert said.startswith("faulty draws wrongly here: its picture is ")
     assert said.endswith("set mapping.renderer: cpu")
 
 
@@ -227,6 +229,28 @@ def test_an_attempt_on_this_machine_comes_back_from_its_process() -> None:
     assert "install onnxruntime-gpu" in apart("cuda").failed
 
 
+@needs_adapter
+def test_an_adapter_draws_as_the_reference_does_and_is_named() -> None:
+    tried = apart("wgpu")
+    assert not tried.failed
+    assert tried.adapters
+    assert tried.figures["difference_picture"] < 1e-4
+    assert tried.figures["difference_gradients"] < 1e-3
+
+
+def test_an_adapter_that_fails_while_it_draws_is_not_to_be_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Failing(ReferenceRenderer):
+        failed = "Some GPU failed (device lost)"
+
+    monkeypatch.setattr("aquaflow.render.webgpu.WgpuRenderer", Failing)
+    said = refusal(attempts.draw_on_adapter)
+    assert said == (
+        "Some GPU failed (device lost); update its driver, or set mapping.renderer: cpu"
+    )
+
+
 def test_what_libraries_print_meanwhile_is_not_the_answer(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -237,7 +261,8 @@ def test_what_libraries_print_meanwhile_is_not_the_answer(
     monkeypatch.setitem(attempts.ATTEMPTS, "cuda", loud)
     monkeypatch.setattr(sys, "argv", ["attempts", "cuda"])
     attempts.main()
-    assert capsys.readouterr().out == '{"figures": {"difference": 0.5}, "failed": ""}\n'
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"figures": {"difference": 0.5}, "failed": "", "adapters": []}
 
 
 # --- the GPU ------------------------------------------------------------------------------------

@@ -5,11 +5,35 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+import pytest
 import torch
 from torch import Tensor
 
 from aquaflow.render.contract import CPU, Renderer, Rendering
+from aquaflow.render.cpu import CpuRenderer, TileRenderer
+from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
+from aquaflow.render.webgpu import WgpuRenderer
+from aquaflow.render.webgpu_device import missing
+
+needs_compiler = pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")
+no_adapter = missing()
+needs_adapter = pytest.mark.skipif(no_adapter is not None, reason=str(no_adapter))
+RENDERERS = [
+    *(pytest.param(isa, marks=needs_compiler) for isa in native.supported_isas()),
+    "tiles",
+    pytest.param("wgpu", marks=needs_adapter),
+]
+"""The renderers that this machine may have, for :func:`make`."""
+
+
+def make(kind: str, threads: int = 2) -> Renderer:
+    """The renderer of this name, or the processor's with this instruction set."""
+    if kind == "reference":
+        return ReferenceRenderer()
+    others = {"tiles": TileRenderer, "wgpu": WgpuRenderer}
+    return others[kind]() if kind in others else CpuRenderer(threads, kind)
+
 
 WIDTH, HEIGHT = 52, 39  # no multiple of a tile or block
 

@@ -7,16 +7,18 @@ import torch
 from torch import Tensor
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.render.contract import TILE_PX, Renderer, active_pixels, tile_grid, touches_active
-from aquaflow.render.cpu import CpuRenderer, TileRenderer
+from aquaflow.render.contract import TILE_PX, active_pixels, tile_grid, touches_active
+from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native
-from aquaflow.render.reference import ReferenceRenderer
 from tests.render.render_scenes import (
     HEIGHT,
     NAMES,
+    RENDERERS,
     WIDTH,
     Scene,
     draw_and_differentiate,
+    make,
+    needs_compiler,
     random_scene,
     reference,
     relative_error,
@@ -27,20 +29,8 @@ CHECKERBOARD = torch.arange(GRID[0])[:, None].add(torch.arange(GRID[1])) % 2 == 
 LEFT = (torch.arange(GRID[1]) < 2).expand(GRID).contiguous()
 LONE = torch.zeros(GRID, dtype=torch.bool)
 LONE[1, 2] = True
+ALL = [*RENDERERS, "reference"]
 MASKS = {"checkerboard": CHECKERBOARD, "left half": LEFT, "one tile": LONE}
-
-needs_compiler = pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")
-RENDERERS = [
-    *(pytest.param(isa, marks=needs_compiler) for isa in native.supported_isas()),
-    "tiles",
-    "reference",
-]
-
-
-def make(kind: str, threads: int = 2) -> Renderer:
-    if kind == "reference":
-        return ReferenceRenderer()
-    return TileRenderer() if kind == "tiles" else CpuRenderer(threads, kind)
 
 
 def dtype_of(kind: str) -> torch.dtype:
@@ -64,7 +54,7 @@ def test_kernels_draw_active_tiles_to_the_same_bits(isa: str, threads: int, mask
     assert torch.equal(part.alpha, whole.alpha * pixels)
 
 
-@pytest.mark.parametrize("kind", RENDERERS)
+@pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("mask", MASKS)
 def test_gradients_are_those_of_a_loss_on_active_tiles_only(kind: str, mask: str) -> None:
     scene, pixels = small_scene(), active_pixels(MASKS[mask], WIDTH, HEIGHT)
@@ -76,11 +66,11 @@ def test_gradients_are_those_of_a_loss_on_active_tiles_only(kind: str, mask: str
         assert relative_error(gradient, expected) < 1e-5, key
 
 
-@pytest.mark.parametrize("kind", RENDERERS[:-1])
+@pytest.mark.parametrize("kind", RENDERERS)
 @pytest.mark.parametrize("mask", MASKS)
 def test_masked_drawing_agrees_with_the_masked_reference(kind: str, mask: str) -> None:
     scene = small_scene(1)
-    oracle = ReferenceRenderer()
+    oracle = make("reference")
     wanted, wanted_gradients = draw_and_differentiate(
         oracle, scene, torch.float64, active=MASKS[mask]
     )
@@ -92,7 +82,7 @@ def test_masked_drawing_agrees_with_the_masked_reference(kind: str, mask: str) -
         assert relative_error(gradient, expected) < 5e-5, key
 
 
-@pytest.mark.parametrize("kind", RENDERERS)
+@pytest.mark.parametrize("kind", ALL)
 def test_a_gaussian_that_reaches_no_active_tile_is_not_visible_and_takes_no_gradient(
     kind: str,
 ) -> None:
@@ -107,7 +97,7 @@ def test_a_gaussian_that_reaches_no_active_tile_is_not_visible_and_takes_no_grad
     assert not any(gradient[dropped].any() for gradient in gradients[:5])
 
 
-@pytest.mark.parametrize("kind", RENDERERS)
+@pytest.mark.parametrize("kind", ALL)
 def test_a_picture_without_active_tiles_is_black_and_takes_no_gradient(kind: str) -> None:
     nothing = torch.zeros(GRID, dtype=torch.bool)
     out, gradients = draw_and_differentiate(
@@ -129,7 +119,7 @@ def test_a_mask_does_not_outlive_its_picture() -> None:
     assert torch.equal(again.image, whole.image)
 
 
-@pytest.mark.parametrize("kind", RENDERERS)
+@pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize(
     "active", [torch.ones(GRID[::-1], dtype=torch.bool), torch.ones(GRID), CHECKERBOARD[0]]
 )

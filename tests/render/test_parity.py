@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from aquaflow.render import cpu_renderer
 from aquaflow.render.contract import CPU, Rendering
+from aquaflow.render.cpu import cpu_renderer
 from aquaflow.render.example_scene import NAMES, SMALL, Size, height_field
 from aquaflow.render.reference import (
     MOST_GRADIENT,

@@ -11,33 +11,26 @@ import torch
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import contract
-from aquaflow.render.contract import Renderer, Rendering
-from aquaflow.render.cpu import CpuRenderer, TileRenderer
+from aquaflow.render.contract import Rendering
+from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.library import STAGES, load_library
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
 from tests.render.render_scenes import (
     HEIGHT,
     NAMES,
+    RENDERERS,
     WIDTH,
     Scene,
     draw_and_differentiate,
+    make,
+    needs_compiler,
     random_scene,
     reference,
     relative_error,
 )
 
-has_compiler = native.find_compiler() is not None
-needs_compiler = pytest.mark.skipif(not has_compiler, reason="no C++ compiler")
-RENDERERS = [
-    *(pytest.param(isa, marks=needs_compiler) for isa in native.supported_isas()),
-    "tiles",
-]
 TOLERANCE = 5e-5
-
-
-def make(kind: str, threads: int = 2) -> Renderer:
-    return TileRenderer() if kind == "tiles" else CpuRenderer(threads, kind)
 
 
 def with_behind(scene: Scene) -> Scene:
@@ -147,7 +140,7 @@ def degenerate_scene() -> tuple[Scene, torch.Tensor]:
 def test_degenerate_gaussians_are_culled_with_zero_gradient(kind: str) -> None:
     scene, sound = degenerate_scene()
     rest = Scene(*(getattr(scene, name)[sound] for name in NAMES[:5]), scene.viewmat, scene.K)
-    renderer = ReferenceRenderer() if kind == "reference" else make(kind)
+    renderer = make(kind)
     dtype = torch.float64 if kind == "reference" else torch.float32
     out, gradients = draw_and_differentiate(renderer, scene, dtype)
     clean, clean_gradients = draw_and_differentiate(renderer, rest, dtype)

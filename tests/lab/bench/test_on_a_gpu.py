@@ -34,6 +34,7 @@ from aquaflow.render import gsplat
 from aquaflow.render.contract import CPU
 from aquaflow.render.example_scene import Size, height_field
 from aquaflow.render.gsplat import Gpu
+from aquaflow.render.webgpu_device import missing
 from tests.command_line import Cli, refused
 from tests.device.device_scenes import SinglePrecision, without_kernels
 from tests.lab.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
@@ -329,10 +330,11 @@ def test_on_a_gpu_its_presets_run_too(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert set(on_gpu) - set(on_cpu) == set(FOR_A_GPU)
 
 
-def test_on_the_cpu_alone_gsplat_is_no_contender(gpu: Counting) -> None:
+def test_on_the_cpu_alone_no_gpu_is_a_contender(gpu: Counting) -> None:
     everything, _ = contenders.contenders_here()
     alone, _ = contenders.contenders_here(device="cpu")
-    assert {c.name for c in everything} - {c.name for c in alone} == {"gsplat"}
+    gpus = {"gsplat"} if missing() else {"gsplat", "wgpu"}
+    assert {c.name for c in everything} - {c.name for c in alone} == gpus
 
 
 # --- CUDA's own clock ---------------------------------------------------------------------------

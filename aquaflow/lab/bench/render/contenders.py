@@ -17,6 +17,7 @@ from aquaflow.render.gsplat import GsplatRenderer
 from aquaflow.render.library import NativeUnavailableError
 from aquaflow.render.native.build import supported_isas
 from aquaflow.render.reference import ReferenceRenderer
+from aquaflow.render.webgpu import WgpuRenderer
 
 TILES_MOST = 30_000 * 640 * 480
 REFERENCE_MOST = SMALL.n * SMALL.pixels
@@ -102,6 +103,11 @@ def contenders_here(device: str | None = None) -> tuple[list[Timed], list[str]]:
             found.append(Timed(GsplatRenderer()))
         except AquaFlowError as error:
             notes.append(f"gsplat is not timed: {error}")
+        try:
+            wgpu = WgpuRenderer()
+            found.append(Timed(wgpu, TILES_MOST if wgpu.is_software else None))
+        except AquaFlowError as error:
+            notes.append(f"wgpu is not timed: {error}")
     found += [Timed(TileRenderer(count), TILES_MOST) for count in thread_counts()]
     found.append(Timed(ReferenceRenderer(), REFERENCE_MOST))
     return found, notes
