@@ -225,7 +225,7 @@ class Mapper:
             return
         chosen = sampled_views(self.views, steps, NEWEST_SHARE, self._random)
         self.scene.centre_water(self.views)
-        with self.scene.learning_from(chosen):
+        with self.scene.learning_from(chosen), self.optimiser.stepping():
             for view in chosen:
                 self._contained_step("optimisation", view, refine_poses=False)
 
@@ -240,7 +240,7 @@ class Mapper:
         if not until.over:
             self.water_fitting.at_once(self.views)
         order = shuffled_views(self.views, steps, self._random) if len(self.gaussians) else []
-        with self.scene.learning_from(order):
+        with self.scene.learning_from(order), self.optimiser.stepping():
             for step, view in enumerate(order):
                 passed = until.passed
                 if passed >= 1.0:

@@ -7,7 +7,9 @@ dropped through it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +20,22 @@ from torch import Tensor
 
 from aquaflow.config import LossConfig, MappingConfig, OptimiserConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.mapping.gpu_steps import GpuSteps
 from aquaflow.mapping.neural.decoder import DECODED
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.adam import SelectiveAdam
-from aquaflow.render.contract import CPU, TILE_PX, active_pixels
+from aquaflow.render.contract import TILE_PX, active_pixels
 from aquaflow.render.dense_adam import DenseAdam
-from aquaflow.render.photometric import depth_loss, outlier_mask, photometric_loss
+from aquaflow.render.photometric import (
+    depth_loss,
+    outlier_mask,
+    photometric_loss,
+    radial_weight,
+)
 from aquaflow.render.transfers import pose_in, registration_out
-from aquaflow.render.views import View, refine_pose
+from aquaflow.render.views import View
+from aquaflow.render.views import refine_pose as refine_pose_of
+from aquaflow.render.webgpu import WgpuRenderer
 from aquaflow.water.exposure import log_gain_at, set_log_gain
 from aquaflow.water.sunlight import light_at
 
@@ -53,6 +63,11 @@ class MapOptimiser:
         self._objective = objective
         self.adam = self._new_adam()
         """Optimiser of the Gaussians' parameters."""
+        renderer = scene.renderer
+        self._gpu: GpuSteps | None = None
+        """Takes the steps where the renderer can; None: they are taken here."""
+        if isinstance(renderer, WgpuRenderer):
+            self._gpu = GpuSteps(renderer, scene, config.loss)
         self.medium_adam = DenseAdam(scene.medium.learned_at(config.medium))
         self.steps = 0
         """Steps taken."""
@@ -81,23 +96,37 @@ class MapOptimiser:
         """
         if len(self.scene.gaussians) == 0:  # all pruned since the steps began
             return
+        config = self.config.optimiser
+        active = tiles_to_draw(view, config)
+        if config.skip_explained and is_nothing_to_draw(view, active, config):
+            view.looks += 1
+            return
+        self.medium_adam.forget_gradients()
+        if (
+            self._gpu is None
+            or not self._gpu.works
+            or not self._step_on_gpu(view, active, refine_pose)
+        ):
+            self._step_here(view, active, refine_pose)
+
+    def _step_here(
+        self,
+        view: View,
+        active: Tensor | None,  # [rows, columns] bool, the tiles to draw
+        refine_pose: bool,
+    ) -> None:
         leaves = {
             name: tensor.detach().requires_grad_(self._is_optimised(name))
             for name, tensor in self.scene.gaussians.parameters.items()
         }
         viewmat = view.viewmat().requires_grad_(refine_pose)
-        self.medium_adam.forget_gradients()
-        active = tiles_to_draw(view, self.config.optimiser)
-        config = self.config.optimiser
-        if config.skip_explained and is_nothing_to_draw(view, active, config):
-            view.looks += 1
-            return
         neural = self.scene.neural
         seen = leaves if neural is None else neural.decode(view, leaves, viewmat)
         # Water and a view's light hardly change from step to step: full looks follow them.
-        learn = is_full_look(view, config)
+        learn = is_full_look(view, self.config.optimiser)
         shown = self.scene.draw(view, seen, viewmat, learn, active)
-        record_explained(view, shown.image, self.config.optimiser)
+        errors = tile_errors(view, shown.image) if learn else None
+        record_look(view, errors, self.config.optimiser)
         loss = self._objective.total(view, shown, seen)
         if not is_number(loss):
             self._undo("loss", view)
@@ -107,10 +136,57 @@ class MapOptimiser:
         gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
         self.adam.step(shown.visible, gradients)
         self._step_medium(view)
-        self._step_pose(view, viewmat)
+        if viewmat.grad is not None:
+            refine_pose_of(view, viewmat.grad, self.config.optimiser.poses)
+        self._count_step(view, lambda: shown.radius_px)
+
+    def _step_on_gpu(
+        self,
+        view: View,
+        active: Tensor | None,  # [rows, columns] bool, the tiles to draw
+        refine_pose: bool,
+    ) -> bool:
+        """The same as :meth:`_step_here`; False where the GPU failed and nothing was done."""
+        gpu, learn = self._gpu, is_full_look(view, self.config.optimiser)
+        assert gpu is not None
+        water_learns = learn or self.scene.medium.directional  # as in Scene.draw
+        with torch.set_grad_enabled(water_learns):
+            water = self.scene.water(view)
+            stack = None if water is None else water.stack()
+        outcome = gpu.step(view, active, learn, stack, self.adam)
+        if outcome is None:
+            return False
+        record_look(view, outcome.errors, self.config.optimiser)
+        if not math.isfinite(outcome.loss):
+            self._undo("loss", view)
+            self.drop_unsound()
+            return True
+        if stack is not None and stack.requires_grad:
+            torch.autograd.backward(stack, outcome.g_water)
+        self._step_medium(view)
+        if refine_pose:
+            refine_pose_of(view, outcome.g_viewmat, self.config.optimiser.poses)
+        self._count_step(view, gpu.radius_px)
+        return True
+
+    def _count_step(self, view: View, radius_px: Callable[[], Tensor]) -> None:
+        """Count a step, and prune now and then; ``radius_px`` [N] is asked for only then."""
         self.steps += 1
         if self.steps % self.config.optimiser.prune_every == 0:
-            self._prune(shown, view)
+            self._prune(radius_px(), view)
+
+    @contextmanager
+    def stepping(self) -> Iterator[None]:
+        """Steps may leave the map on the GPU within; after it, it is on the host."""
+        try:
+            yield
+        finally:
+            self.settle()
+
+    def settle(self) -> None:
+        """Let the Gaussians' parameters and their moments be on the host, as they are."""
+        if self._gpu is not None:
+            self._gpu.settle(self.adam)
 
     def _is_optimised(self, name: str) -> bool:
         """Means and opacities always are; with residuals, the rest only if configured."""
@@ -127,14 +203,6 @@ class MapOptimiser:
             return
         self.medium_adam.step()
 
-    def _step_pose(
-        self,
-        view: View,
-        viewmat: Tensor,  # [4, 4]
-    ) -> None:
-        if viewmat.grad is not None:
-            refine_pose(view, viewmat.grad, self.config.optimiser.poses)
-
     def _undo(self, what: str, view: View) -> None:
         self.undone += 1
         log.warning("non-finite %s on frame %d: step undone", what, view.frame_index)
@@ -148,6 +216,7 @@ class MapOptimiser:
     ) -> None:
         """Add rows for the map's last ``count`` Gaussians, which were seen from the cameras at
         ``centres``; only a decoder uses these."""
+        self.settle()
         self.adam.extend(count)
         if self.scene.neural is not None and centres is not None:
             self.scene.neural.insert(centres, count)
@@ -158,19 +227,26 @@ class MapOptimiser:
         mask: Tensor,  # [N] bool
     ) -> None:
         """Drop the Gaussians where ``mask`` is False, their optimiser state with them."""
+        self.settle()
         if not bool(mask.all()):
             (self.scene.neural or self.scene.gaussians).keep(mask)
             self.adam.keep(mask)
             self.adam.bind(self.scene.gaussians.parameters)
 
-    def _prune(self, shown: RenderedMap, view: View) -> None:
+    def _prune(
+        self,
+        radius_px: Tensor,  # [N]
+        view: View,
+    ) -> None:
         """Drop Gaussians that are almost transparent, or that fill the picture."""
+        self.settle()
         opaque = self.scene.gaussians.opacities > self.config.optimiser.prune_opacity
         widest = PRUNE_RADIUS_WIDTHS * view.camera.width
-        self.keep(opaque & (shown.radius_px < widest))
+        self.keep(opaque & (radius_px < widest))
 
     def drop_unsound(self) -> None:
         """Drop Gaussians that are not finite: the scale loss of one would spoil every step."""
+        self.settle()
         sound = torch.isfinite(self.scene.gaussians.scales.prod(dim=-1))
         for tensor in self.scene.gaussians.parameters.values():
             sound &= torch.isfinite(tensor).all(dim=-1)
@@ -179,6 +255,7 @@ class MapOptimiser:
     def make_whole(self) -> None:
         """Repair after a failure: every row of the optimisers and groups belongs to a Gaussian, and
         all Gaussians are finite."""
+        self.settle()
         if self.scene.neural is not None:
             self.scene.neural.make_whole()
         missing = len(self.scene.gaussians) - len(self.adam.steps)
@@ -230,18 +307,25 @@ def is_nothing_to_draw(
 
 
 @torch.no_grad()
-def record_explained(
+def tile_errors(
     view: View,
     image: Tensor,  # [H, W, 3] the map from this view
+) -> Tensor:
+    """[rows, columns] mean error of each tile, of full scale, where the view shows the scene."""
+    error = (image - view.target()).abs().mean(dim=-1)
+    if view.mask is not None:
+        error *= view.scene_mask()
+    return F.avg_pool2d(error[None], TILE_PX, ceil_mode=True)[0]
+
+
+def record_look(
+    view: View,
+    errors: Tensor | None,  # [rows, columns] of its tiles, after a full drawing
     config: OptimiserConfig,
 ) -> None:
     """Count the step; after a full drawing record which tiles are explained."""
-    if is_full_look(view, config):
-        error = (image - view.target()).abs().mean(dim=-1)
-        if view.mask is not None:
-            error *= view.scene_mask()
-        tiles = F.avg_pool2d(error[None], TILE_PX, ceil_mode=True)[0]
-        view.explained, view.all_explained = tiles < config.noise_floor, None
+    if errors is not None:
+        view.explained, view.all_explained = errors < config.noise_floor, None
     view.looks += 1
 
 
@@ -303,17 +387,7 @@ class Objective:
 
 
 # --------------------------------------------------------------------------------------------------
-# What the loss needs beside the terms of a view that the renderer has: K_rad, and Eq. 23.
-
-RADIAL_VARIANCE = 5.0
-"""sigma^2 of K_rad in units of the half picture: corner weight 0.82 (ARTDECO; docs/paper.md)."""
-
-
-def radial_weight(height: int, width: int, device: torch.device = CPU) -> Tensor:
-    """K_rad [H, W] = exp(-r^2 / (2 sigma^2)), r in [-1, 1]^2 picture coordinates."""
-    y = torch.linspace(-1.0, 1.0, height, device=device)[:, None]
-    x = torch.linspace(-1.0, 1.0, width, device=device)[None, :]
-    return torch.exp(-(x * x + y * y) / (2.0 * RADIAL_VARIANCE)).contiguous()
+# What the loss has beside the terms of a view: Eq. 23.
 
 
 def scale_loss(

@@ -140,7 +140,7 @@ class Scene:
         gain, uneven = self.gain(view), self.uneven(view)
         shown = show(parameters, water, gain, self.renderer, view, viewmat, active, uneven)
         if learn:
-            self._learn_light(view, shown)
+            self.learn_light(view, shown.image.detach(), shown.alpha)
         light = self.sunlight.over(view, self.exposure(view))
         return shown if light is None else replace(shown, image=shown.image * light)
 
@@ -148,11 +148,21 @@ class Scene:
         """The gain [3] of the exposure of ``view``; None where all views have the same."""
         return gain_of(view) if self.exposes else None
 
-    def _learn_light(self, view: View, shown: RenderedMap) -> None:
-        image = shown.image.detach()
+    @property
+    def learns_light(self) -> bool:
+        """Whether :meth:`learn_light` learns anything."""
+        return self.exposes or self.sunlight.config.enabled
+
+    def learn_light(
+        self,
+        view: View,
+        image: Tensor,  # [H, W, 3] the map from this view, in even light
+        alpha: Tensor,  # [H, W]
+    ) -> None:
+        """Set the view's exposure and its light from its picture."""
         if self.exposes:
-            learn_gain(view, image, shown.alpha)
-        self.sunlight.learn(view, image, shown.alpha, self.exposure(view))
+            learn_gain(view, image, alpha)
+        self.sunlight.learn(view, image, alpha, self.exposure(view))
 
     def seen_from(
         self,

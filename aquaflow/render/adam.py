@@ -65,7 +65,8 @@ class SelectiveAdam:
         self.steps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
         self.first_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
         self.second_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
-        self._bias = _bias_table(betas, first.device)
+        self.bias = _bias_table(betas, first.device)
+        """[T, 2] corrections of the first and second moment at step 1 to T; one afterwards."""
         self._check_params(self.params)
 
     def step(
@@ -92,6 +93,10 @@ class SelectiveAdam:
     def skipped(self) -> int:
         """Visible rows not stepped so far because a gradient was not finite."""
         return int(self._skipped)
+
+    def count_skipped(self, rows: int) -> None:
+        """Rows that a step elsewhere, of the same state, left as they were."""
+        self._skipped += rows
 
     def extend(self, n_new: int) -> None:
         """Add state for ``n_new`` rows at the end, at step 0; then ``bind`` the grown tensors."""
@@ -185,8 +190,8 @@ class SelectiveAdam:
             pointer(self.steps, torch.int32),
             *self.betas,
             self.eps,
-            pointer(self._bias),
-            len(self._bias),
+            pointer(self.bias),
+            len(self.bias),
             self.threads,
         )
 
@@ -195,7 +200,7 @@ class SelectiveAdam:
         rows: Tensor,  # [N] bool
         grads: Mapping[str, Tensor],  # each [N, ...]
     ) -> None:
-        bias = self._bias[self.steps.long().clamp(max=len(self._bias) - 1)]
+        bias = self.bias[self.steps.long().clamp(max=len(self.bias) - 1)]
         self.steps += rows
         kernel = fused_kernel(self.steps.device.type)
         step = step_rows if kernel is None else partial(step_rows_fused, kernel)

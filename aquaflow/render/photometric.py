@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from aquaflow.base.errors import AquaFlowError
+from aquaflow.render.contract import CPU
 from aquaflow.render.library import Library, library_or_none
 from aquaflow.render.tensor_address import pointer
 
@@ -171,6 +172,17 @@ class _Photometric(KnownGradient):
 # What the loss of a view has beside the pictures' likeness: outliers, and the prior's ranges.
 #
 # Each has its definition in torch, which is the oracle of the kernel and what other devices use.
+
+RADIAL_VARIANCE = 5.0
+"""sigma^2 of K_rad in units of the half picture: corner weight 0.82 (ARTDECO; docs/paper.md)."""
+
+
+def radial_weight(height: int, width: int, device: torch.device = CPU) -> Tensor:
+    """K_rad [H, W] = exp(-r^2 / (2 sigma^2)), r in [-1, 1]^2 picture coordinates."""
+    y = torch.linspace(-1.0, 1.0, height, device=device)[:, None]
+    x = torch.linspace(-1.0, 1.0, width, device=device)[None, :]
+    return torch.exp(-(x * x + y * y) / (2.0 * RADIAL_VARIANCE)).contiguous()
+
 
 MIN_RANGE = 1e-2
 """Map units; guards 1 / range."""

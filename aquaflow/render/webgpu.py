@@ -153,45 +153,39 @@ class _Camera:
     height: int
     active: Tensor | None  # [rows, columns] bool
 
-    def tiles_drawn(self) -> npt.NDArray[np.uint32]:
-        """[rows, columns]"""
-        if self.active is None:
-            return np.ones(tile_grid(self.width, self.height), np.uint32)
-        return self.active.numpy().astype(np.uint32)
 
-    def bits(
-        self,
-        viewmat: Tensor,  # [4, 4] world -> camera
-        count: int,
-    ) -> npt.NDArray[np.uint32]:
-        """[28] the struct Camera of camera.wgsl; one that is not finite sees nothing."""
-        rows = viewmat[:3].numpy().astype(np.float32)
-        if not np.isfinite(rows).all():
-            rows = np.zeros((3, 4), np.float32)  # all depths are 0: behind the near plane
-        fx, fy, cx, cy = (float(self.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        beyond = [0.5 * TANGENT_MARGIN * side for side in (self.width, self.height)]
-        tangents = (
-            *((-cx - beyond[0]) / fx, (self.width - cx + beyond[0]) / fx),
-            *((-cy - beyond[1]) / fy, (self.height - cy + beyond[1]) / fy),
-        )
-        floats = np.array([*rows.ravel(), fx, fy, cx, cy, *tangents], np.float32)
-        tile_rows, columns = tile_grid(self.width, self.height)
-        whole = [self.width, self.height, columns, tile_rows, count, 0, 0, 0]
-        return np.concatenate([floats.view(np.uint32), np.array(whole, np.uint32)])
+def drawn_tiles(
+    active: Tensor | None,  # [rows, columns] bool
+    width: int,
+    height: int,
+) -> npt.NDArray[np.uint32]:
+    """[rows, columns], as the kernels have them; None: all are drawn."""
+    if active is None:
+        return np.ones(tile_grid(width, height), np.uint32)
+    return active.numpy().astype(np.uint32)
 
 
-def pack(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colours: Tensor,  # [N, C]
-) -> npt.NDArray[np.float32]:
-    """[N, ROW], as the kernels have them."""
-    rows = torch.zeros(len(means), ROW)
-    rows[:, :3], rows[:, 3], rows[:, 4:8], rows[:, 8:11] = means, opacities, quats, scales
-    rows[:, 12 : 12 + colours.shape[1]] = colours
-    return np.asarray(rows.numpy())
+def camera_bits(
+    viewmat: Tensor,  # [4, 4] world -> camera
+    K: Tensor,  # [3, 3] px
+    width: int,
+    height: int,
+    count: int,
+) -> npt.NDArray[np.uint32]:
+    """[28] the struct Camera of camera.wgsl; one that is not finite sees nothing."""
+    rows = viewmat[:3].numpy().astype(np.float32)
+    if not np.isfinite(rows).all():
+        rows = np.zeros((3, 4), np.float32)  # all depths are 0: behind the near plane
+    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    beyond = [0.5 * TANGENT_MARGIN * side for side in (width, height)]
+    tangents = (
+        *((-cx - beyond[0]) / fx, (width - cx + beyond[0]) / fx),
+        *((-cy - beyond[1]) / fy, (height - cy + beyond[1]) / fy),
+    )
+    floats = np.array([*rows.ravel(), fx, fy, cx, cy, *tangents], np.float32)
+    tile_rows, columns = tile_grid(width, height)
+    whole = np.array([width, height, columns, tile_rows, count, 0, 0, 0], np.uint32)
+    return np.concatenate([floats.view(np.uint32), whole])
 
 
 class _Rasterise(torch.autograd.Function):
@@ -210,9 +204,12 @@ class _Rasterise(torch.autograd.Function):
         gaussians = (means, quats, scales, opacities, colours)
         ctx.lease, ctx.camera, ctx.renderer = renderer.lease(), camera, renderer
         colours_drawn, rest, radius_px = ctx.lease.drawing.draw(
-            _pack(*gaussians), camera.bits(viewmat, len(means)), camera.tiles_drawn(),
-            camera.width, camera.height,
-        )  # fmt: skip
+            _pack(*gaussians),
+            camera_bits(viewmat, camera.K, camera.width, camera.height, len(means)),
+            drawn_tiles(camera.active, camera.width, camera.height),
+            camera.width,
+            camera.height,
+        )
         image = colours_drawn[..., : colours.shape[1]].contiguous()
         ctx.save_for_backward(*gaussians, viewmat, image, rest)
         ctx.mark_non_differentiable(radius_px)

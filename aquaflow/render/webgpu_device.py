@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import AquaFlowError, first_line
-from aquaflow.render import contract
+from aquaflow.render import adam, contract, photometric, water
 
 FOLDER = Path(__file__).parent / "wgsl"
 """Where the kernels are."""
@@ -123,6 +123,8 @@ class Device:
         self.most_bytes = min(limits.values())
         """Of one buffer."""
         self.lock = threading.Lock()
+        self.bytes_up = self.bytes_down = 0
+        """Moved so far, from and to the host."""
         self._usage = _wgpu().BufferUsage
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[str, Any] = {}
@@ -155,6 +157,7 @@ class Device:
     ) -> None:
         """Copy numbers to the beginning of a buffer."""
         if numbers.size:
+            self.bytes_up += numbers.nbytes
             self.device.queue.write_buffer(buffer, 0, np.ascontiguousarray(numbers))
 
     def kernel(self, file: str, name: str, bindings: Mapping[int, Any]) -> tuple[Any, Any]:
@@ -194,6 +197,7 @@ class Device:
         """The first numbers of buffers, each with their count, in one wait for the device."""
         use = self._usage
         total = sum(4 * count for _, count in parts)
+        self.bytes_down += total
         staging = self.device.create_buffer(size=max(total, 4), usage=use.MAP_READ | use.COPY_DST)
         encoder, offset = self.device.create_command_encoder(), 0
         for buffer, count in parts:
@@ -232,6 +236,12 @@ _PARTS = {
     "project_backward": ("camera", "footprint"),
     "sort": (),
     "sum": (),
+    "activate": ("step",),
+    "compose": ("step",),
+    "loss": ("step",),
+    "compose_backward": ("step",),
+    "adam": ("step",),
+    "reduce": (),
 }
 """Files that come before each file of kernels: WGSL has no include."""
 
@@ -242,20 +252,33 @@ def _read_source(file: str) -> str:
 
 
 def _constants() -> str:
-    """The constants of the contract, as WGSL."""
+    """The constants of the definitions in torch, as WGSL."""
     floats = {
-        name: getattr(contract, name)
-        for name in (
-            *("DILATION_PX2", "MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE", "NEAR_PLANE_M"),
-            *("MIN_QUAT_NORM_SQ", "MAX_SIGMA_PX", "RADIUS_SIGMAS"),
-        )
-    }
-    floats |= {
         "LOG2_MIN_ALPHA": math.log2(contract.MIN_ALPHA),
         "LOG2E": math.log2(math.e),
         "LN2": math.log(2.0),
+        "SSIM_TAPS": sum(
+            math.exp(-(k * k) / (2.0 * photometric.SSIM_SIGMA_PX**2))
+            for k in range(-(photometric.SSIM_WINDOW // 2), photometric.SSIM_WINDOW // 2 + 1)
+        ),
     }
+    for module, names in _NAMES.items():
+        floats |= {name: getattr(module, name) for name in names}
     whole = {"TILE_PX": contract.TILE_PX, "MOMENTS": MOMENTS, "CHUNK": CHUNK}
     lines = [f"const {name}: f32 = {value:.9g};" for name, value in floats.items()]
     lines += [f"const {name}: u32 = {value};" for name, value in whole.items()]
     return "\n".join(lines)
+
+
+_NAMES: dict[Any, tuple[str, ...]] = {
+    contract: (
+        *("DILATION_PX2", "MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE", "NEAR_PLANE_M"),
+        *("MIN_QUAT_NORM_SQ", "MAX_SIGMA_PX", "RADIUS_SIGMAS", "COLOUR_SHARPNESS"),
+    ),
+    photometric: (
+        *("SSIM_SIGMA_PX", "SSIM_C1", "SSIM_C2", "MIN_RANGE", "SOLID", "RADIAL_VARIANCE"),
+    ),
+    water: ("MAX_OPTICAL_DEPTH", "MIN_SOLID"),
+    adam: ("LARGEST_GRADIENT",),
+}
+"""Constants of kernels, by the module that defines them."""

@@ -73,22 +73,23 @@ class Drawing:
             same = False
         if not same:
             self.count, self.size = count, (width, height)
-            self._draw, self._differentiate = self._plan(), self._plan_backward()
+            self.drawing_steps, self.gradient_steps = self._plan(), self._plan_backward()
 
     def make_room(self, hits: int) -> None:
         """Have room for so many hits of tiles."""
         self.hits, self._hits = int(ROOM * hits), {}
 
-    def _named(self) -> dict[str, Any]:
+    def named(self) -> dict[str, Any]:
+        """All buffers by name."""
         return {**self._fixed, **self._rows, **self._pixels, **self._hits}
 
     # --- the kernels, in their order ----------------------------------------------------------
 
     def _plan(self) -> list[Step]:
-        at, count = self._named(), self.count
+        at, count = self.named(), self.count
         rows, columns = tile_grid(*self.size)
         by_gaussian, by_hit = -(-count // WORKGROUP), -(-self.hits // WORKGROUP)
-        plan = [self._step(
+        plan = [self.step(
             "project", "project", by_gaussian,
             "camera", "gaussians", "tiles_drawn", "splats", "keys", "hits", "radius",
         )]  # fmt: skip
@@ -97,17 +98,17 @@ class Drawing:
         plan += sorting
         listing = (order, "splats", "hits", "tiles_drawn", "blocks", "tile", "owners", "starts")
         blocks = self.device.uniform(np.array([by_gaussian, 0, 0, 0], np.uint32))
-        plan.append(self._step("hits", "count_hits", by_gaussian, "camera", *listing))
-        plan.append(self._step("sum", "sum", 1, blocks, "blocks", "total"))
-        plan.append(self._step("hits", "list_hits", by_gaussian, "camera", *listing))
+        plan.append(self.step("hits", "count_hits", by_gaussian, "camera", *listing))
+        plan.append(self.step("sum", "sum", 1, blocks, "blocks", "total"))
+        plan.append(self.step("hits", "list_hits", by_gaussian, "camera", *listing))
         tiles = ("tile", "sorted", "hit_counts", "total")
         bits = max(1, int(rows * columns - 1).bit_length())
         sorting, hits = self._sort(tiles, self.hits, bits)
         plan += sorting
         tile = "tile_to" if hits == "sorted_to" else "tile"
-        plan.append(self._step("ranges", "find_ranges", by_hit, "camera", "total", tile, "ranges"))
+        plan.append(self.step("ranges", "find_ranges", by_hit, "camera", "total", tile, "ranges"))
         self._hits["in_order"] = at[hits]
-        plan.append(self._step(
+        plan.append(self.step(
             "blend", "blend", (columns, rows),
             "camera", "ranges", "in_order", "owners", "splats", "colours", "rest",
         ))  # fmt: skip
@@ -116,11 +117,11 @@ class Drawing:
     def _plan_backward(self) -> list[Step]:
         rows, columns = tile_grid(*self.size)
         return [
-            self._step(
+            self.step(
                 "blend_backward", "blend_backward", (columns, rows),
                 "camera", "ranges", "in_order", "owners", "splats", "behind", "incoming", "moments",
             ),
-            self._step(
+            self.step(
                 "project_backward", "project_backward", -(-self.count // WORKGROUP),
                 "camera", "gaussians", "splats", "hits", "starts", "moments", "gradients", "view",
             ),
@@ -141,15 +142,15 @@ class Drawing:
             numbers = np.array([shift, blocks, shift == 0, 0], np.uint32)
             turn = self.device.uniform(numbers)
             bound = (turn, total, *there, table, *to)
-            plan.append(self._step("sort", "count", blocks, *bound))
-            plan.append(self._step("sum", "sum", 1, entries, table, "unread"))
-            plan.append(self._step("sort", "move_keys", blocks, *bound))
+            plan.append(self.step("sort", "count", blocks, *bound))
+            plan.append(self.step("sum", "sum", 1, entries, table, "unread"))
+            plan.append(self.step("sort", "move_keys", blocks, *bound))
             there, to = to, there
         return plan, there[1]
 
-    def _step(self, file: str, kernel: str, groups: int | tuple[int, int], *bound: Any) -> Step:
+    def step(self, file: str, kernel: str, groups: int | tuple[int, int], *bound: Any) -> Step:
         """A kernel on buffers, in the order of its bindings; a name stands for one of ours."""
-        named = self._named()
+        named = self.named()
         buffers = [named[each] if isinstance(each, str) else each for each in bound]
         used = _USED.get(kernel, range(len(buffers)))
         pipeline, bindings = self.device.kernel(
@@ -171,12 +172,12 @@ class Drawing:
         with self.device.lock:
             while True:
                 self.prepare(len(gaussians), width, height)
-                at, pixels = self._named(), width * height
+                at, pixels = self.named(), width * height
                 self.device.write(at["gaussians"], gaussians)
                 self.device.write(at["camera"], camera)
                 self.device.write(at["tiles_drawn"], tiles_drawn)
                 self.device.write(at["listed"], np.array([self.count], np.uint32))
-                self.device.submit(self._draw, clear=[at["ranges"]])
+                self.device.submit(self.drawing_steps, clear=[at["ranges"]])
                 wanted = {"colours": 4 * pixels, "rest": pixels, "radius": self.count, "total": 1}
                 colours, rest, radius, total = self.device.read(
                     [(at[name], count) for name, count in wanted.items()]
@@ -195,10 +196,10 @@ class Drawing:
     ) -> tuple[Tensor, Tensor]:
         """Gradients of the Gaussians [N, ROW] and of the view matrix [4, 4]."""
         with self.device.lock:
-            at, blocks = self._named(), -(-self.count // WORKGROUP)
+            at, blocks = self.named(), -(-self.count // WORKGROUP)
             self.device.write(at["behind"], behind)
             self.device.write(at["incoming"], incoming)
-            self.device.submit(self._differentiate, clear=[at["moments"]])
+            self.device.submit(self.gradient_steps, clear=[at["moments"]])
             gradients, view = self.device.read(
                 [(at["gradients"], ROW * self.count), (at["view"], 12 * blocks)]
             )
@@ -210,5 +211,7 @@ class Drawing:
 _USED = {
     "count": (0, 1, 2, 4),
     "count_hits": (0, 1, 3, 5),
+    "compare": (0, 1, 2, 3, 4, 5, 6),
+    "differentiate": (0, 1, 2, 3, 4, 5, 7),
 }
 """Bindings of kernels that use only some of those that their file declares."""

@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from aquaflow import render
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import gsplat, select_renderer
 from aquaflow.render.cpu import CpuRenderer
@@ -68,7 +69,7 @@ def refusal() -> str:
 def test_nothing_is_missing_where_all_is_there() -> None:
     assert gsplat.missing() is None
     assert isinstance(select_renderer("gsplat"), gsplat.GsplatRenderer)
-    assert isinstance(select_renderer("auto"), gsplat.GsplatRenderer)
+    assert render._gpu_renderers(None)[0] is gsplat.GsplatRenderer  # which auto measures
 
 
 def test_without_a_cuda_device_the_cpu_is_named(

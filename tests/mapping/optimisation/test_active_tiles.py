@@ -8,7 +8,7 @@ import torch
 
 from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.optimisation import record_explained, tiles_to_draw
+from aquaflow.mapping.optimisation import record_look, tile_errors, tiles_to_draw
 from aquaflow.render.views import View
 from tests.mapping.mapping_scenes import (
     copied,
@@ -30,7 +30,7 @@ def looked_at(config: OptimiserConfig = CONFIG) -> View:
     view = view_of(np.full((48, 64, 3), 128, np.uint8))
     image = view.target() + 0.005
     image[:16, :16] += 0.05
-    record_explained(view, image, config)
+    record_look(view, tile_errors(view, image), config)
     return view
 
 
@@ -49,9 +49,9 @@ def test_now_and_then_everything_is_looked_at_and_remembered_anew() -> None:
     view = looked_at()
     for _ in range(2):
         assert tiles_to_draw(view, CONFIG) is not None
-        record_explained(view, torch.zeros(48, 64, 3), CONFIG)  # what was not drawn is not judged
+        record_look(view, None, CONFIG)
     assert tiles_to_draw(view, CONFIG) is None
-    record_explained(view, view.target(), CONFIG)
+    record_look(view, tile_errors(view, view.target()), CONFIG)
     tiles = tiles_to_draw(view, CONFIG)
     assert tiles is not None
     assert not tiles.any()
@@ -71,7 +71,7 @@ def test_tiles_that_show_only_the_vehicle_are_never_drawn() -> None:
         assert tiles is not None
         assert tiles[:, :2].all()
         assert not tiles[:, 2:].any()
-        record_explained(view, torch.ones(48, 64, 3), CONFIG)
+        record_look(view, None, CONFIG)
 
 
 def test_a_step_leaves_alone_what_only_explained_tiles_show() -> None:
