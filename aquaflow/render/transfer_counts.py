@@ -1,4 +1,5 @@
-"""How many tensors crossed between the host and the map's device, by the name of the crossing."""
+"""How many tensors crossed between the host and the map's device, by the name of the crossing; of
+wgpu, which moves buffers, how many bytes."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ class TransferCounts:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
-    def add(self, name: str, tensors: int = 1) -> None:
-        """``tensors`` were moved by the function ``name``."""
+    def add(self, name: str, moved: int = 1) -> None:
+        """Tensors were ``moved`` by the function ``name``, or bytes by wgpu."""
         with self._lock:
-            self._counts[name] += tensors
+            self._counts[name] += moved
 
     def take(self) -> dict[str, int]:
         """The counts so far, by name."""
@@ -29,5 +30,5 @@ COUNTS = TransferCounts()
 
 
 def transfers() -> dict[str, int]:
-    """Tensors moved so far in this process, by the name of the function that moved them."""
+    """Tensors moved so far in this process, by the name of what moved them; of wgpu, bytes."""
     return COUNTS.take()

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import AquaFlowError, first_line
 from aquaflow.render import adam, contract, photometric, water
+from aquaflow.render.transfer_counts import COUNTS
 
 FOLDER = Path(__file__).parent / "wgsl"
 """Where the kernels are."""
@@ -123,8 +124,6 @@ class Device:
         self.most_bytes = min(limits.values())
         """Of one buffer."""
         self.lock = threading.Lock()
-        self.bytes_up = self.bytes_down = 0
-        """Moved so far, from and to the host."""
         self._usage = _wgpu().BufferUsage
         self._modules: dict[str, Any] = {}
         self._pipelines: dict[str, Any] = {}
@@ -157,7 +156,7 @@ class Device:
     ) -> None:
         """Copy numbers to the beginning of a buffer."""
         if numbers.size:
-            self.bytes_up += numbers.nbytes
+            COUNTS.add("wgpu bytes up", numbers.nbytes)
             self.device.queue.write_buffer(buffer, 0, np.ascontiguousarray(numbers))
 
     def kernel(self, file: str, name: str, bindings: Mapping[int, Any]) -> tuple[Any, Any]:
@@ -197,7 +196,7 @@ class Device:
         """The first numbers of buffers, each with their count, in one wait for the device."""
         use = self._usage
         total = sum(4 * count for _, count in parts)
-        self.bytes_down += total
+        COUNTS.add("wgpu bytes down", total)
         staging = self.device.create_buffer(size=max(total, 4), usage=use.MAP_READ | use.COPY_DST)
         encoder, offset = self.device.create_command_encoder(), 0
         for buffer, count in parts:

@@ -87,7 +87,6 @@ class MapOnGpu:
         self._pixels: dict[str, Any] = {}
         self._small: dict[str, Any] = {}
         self._planned: tuple[int, int, tuple[int, int], int] | None = None
-        self._hits_room = 0
         self._count = 0
 
     # --- the map, up and down -----------------------------------------------------------------

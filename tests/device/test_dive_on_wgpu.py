@@ -38,6 +38,7 @@ def test_a_dive_on_wgpu_is_that_of_the_processor(recording: Path, tmp_path: Path
     assert found["psnr"] == pytest.approx(wanted["psnr"], abs=0.1)
     assert found["tracked"] == wanted["tracked"] == found["frames"]
     assert found["steps"] == wanted["steps"]
+    assert found["transfers"]["wgpu bytes up"] > found["transfers"]["wgpu bytes down"] > 0
     assert found["gaussians"] == pytest.approx(wanted["gaussians"], rel=0.02)
 
 
@@ -60,4 +61,5 @@ def test_a_dive_whose_gpu_is_lost_while_it_refines_is_whole(
     assert count == 61
     assert found["renderer"].startswith("cpu (")
     assert found["complete"]
-    assert found["psnr"] == pytest.approx(wanted["psnr"], abs=0.5)
+    # Four of thirty steps may be lost, where the map is still improving fast.
+    assert found["psnr"] == pytest.approx(wanted["psnr"], abs=1.0)

@@ -15,9 +15,10 @@ from aquaflow.mapping import gpu_steps
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import Renderer
 from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.transfer_counts import transfers
 from aquaflow.render.views import View
 from aquaflow.render.webgpu import WgpuRenderer
-from aquaflow.render.webgpu_device import Device, shared_device
+from aquaflow.render.webgpu_device import Device
 from tests.mapping.mapping_scenes import CAMERA, cloud, floor, path, picture, view_of
 from tests.render.render_scenes import needs_adapter, needs_compiler, relative_error
 
@@ -151,19 +152,25 @@ def test_gaussians_are_pruned_and_added_between_steps_as_on_the_processor() -> N
 
 
 def test_a_step_moves_the_picture_up_and_numbers_down() -> None:
-    mapper, device = mapped(WgpuRenderer(1), Case(robust=True, ranges=True)), shared_device()
+    mapper = mapped(WgpuRenderer(1), Case(robust=True, ranges=True))
     pixels, gaussians = CAMERA.width * CAMERA.height, 64 * len(mapper.gaussians)
     with mapper.optimiser.stepping():
         for k in range(3):  # each view's first look is at all of it
             mapper.optimiser.step(mapper.views[k], refine_pose=True)
-        up, down = device.bytes_up, device.bytes_down
+        before = moved()
         mapper.optimiser.step(mapper.views[0], refine_pose=True)
-        moved_up, moved_down = device.bytes_up - up, device.bytes_down - down
-        up, down = device.bytes_up, device.bytes_down
-    assert 12 * pixels <= moved_up < 12 * pixels + 600
-    assert moved_down < 200
-    assert device.bytes_down - down == 3 * gaussians
-    assert device.bytes_up == up
+        stepped = moved()
+    settled = moved()
+    up, down = (after - first for first, after in zip(before, stepped, strict=True))
+    assert 12 * pixels <= up < 12 * pixels + 600
+    assert down < 200
+    assert settled == (stepped[0], stepped[1] + 3 * gaussians)
+
+
+def moved() -> tuple[int, int]:
+    """Bytes that wgpu moved so far, up and down."""
+    counts = transfers()
+    return counts["wgpu bytes up"], counts["wgpu bytes down"]
 
 
 def test_a_loss_that_is_not_finite_moves_nothing() -> None:
