@@ -1,6 +1,7 @@
 # What an installation needs for the device that maps are drawn on; read by install.sh.
 #
 #   cpu     nothing more than AquaFlow itself
+#   any     wgpu, for a GPU of any maker with a Vulkan driver; torch and priors stay on the processor
 #   cuda    x86_64 with an NVIDIA GPU: PyPI's torch and onnxruntime-gpu, both for CUDA 13; gsplat,
 #           compiled here
 #   jetson  Orin with JetPack 6 (CUDA 12.6, Python 3.10): wheels of NVIDIA's Jetson AI Lab, which PyPI
@@ -18,7 +19,7 @@ orin_capability=8.7
 compile_jobs=2
 
 # One word for the device, from what was asked for and from the build of torch that was chosen.
-#   choose_device ASKED BUILD [ROOT], where ASKED is auto, cpu, cuda or jetson
+#   choose_device ASKED BUILD [ROOT], where ASKED is auto, cpu, any, cuda or jetson
 choose_device() {
   local asked=$1 build=$2 release=${3:-}/etc/nv_tegra_release
   if [[ $asked != auto ]]; then
@@ -36,7 +37,8 @@ choose_device() {
 #   torch_of DEVICE PYTHON; a torch of the system's that reaches the Jetson's GPU stays
 torch_of() {
   case $1 in
-    cpu | cuda) echo "$1" ;;
+    cpu | any) echo cpu ;;
+    cuda) echo cuda ;;
     jetson)
       if "$2" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())' 2>/dev/null; then
         echo system
@@ -46,11 +48,13 @@ torch_of() {
   esac
 }
 
-# AquaFlow's extras for a device: onnxruntime-gpu takes onnxruntime's place, as both are one module.
+# AquaFlow's extras for a device: wgpu, or onnxruntime-gpu, which takes onnxruntime's place, as both are one module.
 #   extras_for DEVICE PYTHON EXTRAS
 extras_for() {
   local device=$1 python=$2 extras=,$3,
-  if [[ $device == cuda ]] && ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+  if [[ $device == any ]]; then
+    extras=,${3:+$3,}gpu-any,
+  elif [[ $device == cuda ]] && ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
     echo 'install.sh: onnxruntime-gpu for CUDA 13 needs Python 3.11; learned priors stay on the processor' >&2
   elif [[ $device != cpu ]]; then
     extras=${extras/,prior,/,prior-gpu,}

@@ -6,7 +6,7 @@
 #     --python PROGRAM   interpreter of the environment (default: python3)
 #     --wheelhouse DIR   install from these wheels only, without a network
 #     --extras LIST      optional parts (default: prior,telemetry,recording)
-#     --device DEVICE    cpu, cuda or jetson: where maps are drawn and learned priors run (default:
+#     --device DEVICE    cpu, any, cuda or jetson: where maps are drawn and learned priors run (default:
 #                        auto, cuda where a GPU answers, jetson where torch reaches a Jetson's, or cpu)
 #     --torch BUILD      cpu, cuda, or system for the torch that --python has (default: the device's)
 #     --no-start         install, but neither enable nor start
@@ -44,7 +44,10 @@ while (($#)); do
 done
 
 case $torch in auto | cpu | cuda | system) ;; *) fail "--torch is auto, cpu, cuda or system, not $torch" ;; esac
-case $device in auto | cpu | cuda | jetson) ;; *) fail "--device is auto, cpu, cuda or jetson, not $device" ;; esac
+case $device in
+  auto | cpu | any | cuda | jetson) ;;
+  *) fail "--device is auto, cpu, any, cuda or jetson, not $device" ;;
+esac
 [[ -n $dry ]] || ((EUID == 0)) || fail 'run me as root: sudo deploy/install.sh'
 [[ -z $config || -f $config ]] || fail "there is no config at $config"
 [[ -z $wheelhouse || -d $wheelhouse ]] || fail "there is no wheelhouse at $wheelhouse"
@@ -80,7 +83,7 @@ extras=$(extras_for "$device" "$python" "$extras")
 # Neither a wheelhouse nor a list of hashes holds what a GPU needs beyond torch.
 offline=''
 if [[ -n $wheelhouse || -f $here/requirements.lock ]]; then offline=yes; fi
-if [[ $device != cpu && -n $offline ]]; then
+if [[ ($device == cuda || $device == jetson) && -n $offline ]]; then
   echo 'install.sh: onnxruntime-gpu and gsplat are not in a wheelhouse: priors and maps stay on the processor' >&2
   device=cpu extras=${extras/prior-gpu/prior}
 fi
@@ -131,7 +134,7 @@ else
   run "${pip[@]}" --constraint "$pins" --upgrade "${source}${extras:+[$extras]}" "${apart[@]}" ||
     fail "pip could not install it; pip's own words are above (torch: $build)"
 fi
-if [[ $device != cpu ]]; then compile_gsplat "$program/venv" "$(capability_of "$device")" "$pins"; fi
+if [[ $device == cuda || $device == jetson ]]; then compile_gsplat "$program/venv" "$(capability_of "$device")" "$pins"; fi
 run install -m 0644 "$here/README.md" "$program/share/README.md"
 if [[ -n $dry ]]; then exit; fi
 

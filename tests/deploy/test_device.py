@@ -106,6 +106,14 @@ def test_without_a_gpu_nothing_but_the_wheels_for_processors_is_taken(machine: M
     ]
 
 
+def test_a_gpu_of_any_maker_gets_wgpu_and_the_wheels_for_processors(machine: Machine) -> None:
+    said, *steps = plan(machine, "--device", "any")
+    assert said == "install.sh: device any, torch cpu, extras prior,telemetry,recording,gpu-any"
+    (aquaflow,) = (step for step in steps if "pip" in step)
+    assert aquaflow.endswith("CHECKOUT[prior,telemetry,recording,gpu-any]")
+    assert plan(machine, "--device", "any", "--extras", "")[0].endswith("extras gpu-any")
+
+
 def test_a_gpu_gets_onnxruntimes_build_for_it_and_gsplat_compiled_for_it(machine: Machine) -> None:
     machine.gpu = "8.6"
     said, *steps = plan(machine)
@@ -197,7 +205,7 @@ def test_torch_can_be_chosen_apart_from_the_device(machine: Machine) -> None:
 def test_a_device_that_does_not_exist_is_refused(machine: Machine) -> None:
     ran = machine.install("--device", "tpu")
     assert ran.returncode == 1
-    assert "--device is auto, cpu, cuda or jetson, not tpu" in ran.stderr
+    assert "--device is auto, cpu, any, cuda or jetson, not tpu" in ran.stderr
 
 
 def test_the_jetsons_torch_is_the_one_that_is_pinned(tmp_path: Path) -> None:
