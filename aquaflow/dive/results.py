@@ -51,7 +51,7 @@ class WaterSummary:
     white_gain: list[float]
     """Of the clean radiance in restored pictures and map_clear.ply, in all."""
     white_choice: str
-    """``camera``, ``neutral``, ``daylight:TYPE``, or the ``FRAME:X,Y`` that is grey."""
+    """:attr:`aquaflow.water.white_balance.ChosenWhite.name`."""
     chosen_gain: list[float]
     """What of ``white_gain`` comes on top of the camera's white balance."""
     chosen_gain_sigma: list[float] | None

@@ -19,7 +19,7 @@ from aquaflow.mapping.restoration import mean_water, restored_own, was_restored
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
-from aquaflow.water.daylight import daylight_at
+from aquaflow.water.daylight import daylight_at, type_named, types_like
 from aquaflow.water.illuminant import (
     SCENE_ERROR,
     Illuminant,
@@ -101,9 +101,13 @@ def _illuminant_of(grey: Grey) -> Illuminant:
 def _daylight(mapper: Mapper, choice: str) -> Illuminant | None:
     """What a choice of daylight says of the light, in the camera's white balance."""
     balance, depths = mapper.scene.balance, mapper.depths
-    if balance is None or depths is None or not choice.startswith(DAYLIGHT):
+    water = mean_water(mapper.scene, mapper.views)
+    if not choice.startswith(DAYLIGHT) or balance is None or depths is None or water is None:
         return None
-    light = daylight_at(choice.removeprefix(DAYLIGHT), depths)
+    _, _, named = choice.partition(":")
+    sigma = balance.attenuation_sigma
+    types = type_named(named) if named else types_like(water_out(water.beta_a), sigma)
+    light = daylight_at(types, depths)
     log = light.log + np.log(balance.gain)
     return Illuminant(log - log.mean(), light.sigma)
 

@@ -171,8 +171,9 @@ def test_a_browser_shows_the_white_balance_that_was_chosen_and_knows_that_of_the
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ("sepia", "'sepia' is no white balance; give camera, neutral, daylight:TYPE .*, or FRAME"),
+        ("sepia", "'sepia' is no white balance; give camera, neutral, daylight, daylight:T"),
         ("daylight:4D", "'daylight:4D' names no water type .* oceanic_I, .*, coastal_9C"),
+        ("daylight", "no depth below the surface.*map it with --telemetry"),
         ("daylight:oceanic_II", "no depth below the surface.*map it with --telemetry"),
         ("1:3", "is no white balance"),
         ("x:3,4", "is no white balance"),
