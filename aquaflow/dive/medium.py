@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 
 Rgb: TypeAlias = tuple[float, float, float]
 FloatArray: TypeAlias = npt.NDArray[np.floating]

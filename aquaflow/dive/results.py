@@ -19,7 +19,7 @@ from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "

@@ -167,8 +167,10 @@ def _looks(mapper: Mapper, find_light: bool) -> _Looks:
     said, weights = list[Array](), list[float]()
     for view in spread:
         shown = mapper.show(view)
-        own = restored_own(mapper.scene, view, shown)
-        if view.has_pixels and view.image.size:
+        has_picture = view.has_pixels and view.image.size > 0
+        if find_light or not has_picture:
+            own = restored_own(mapper.scene, view, shown)
+        if has_picture:
             samples.append(_in_picture(mapper.scene, view, shown))
         else:
             samples.append(seen_and_clear(view, shown, own))

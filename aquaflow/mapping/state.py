@@ -40,7 +40,7 @@ from aquaflow.render.dense_adam import STEP, DenseAdam
 from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
 from aquaflow.water.exposure import log_gains_of, set_log_gain
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.sightings import SOLID
 from aquaflow.water.sunlight import COLUMNS
 from aquaflow.water.tone import ShownTone, tone_of

@@ -8,7 +8,7 @@ of the surface has: the ray on which it is seen, and its normal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,45 @@ LEAST_COSINE = 0.01
 RAYS, STEPS, FIRST_STEP = 100, 10, 0.02
 """On which the glow is looked at: rays of the observations, places on each, even in the logarithm
 of the distance, and the first of them over the median range."""
+NEAREST_LIT = 0.1
+"""Share of a lamp's reference range up to which its light is the same: nothing is seen so near."""
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Light from beside the camera on top of the light that is everywhere.
+
+    What is seen at range z gets ``1 - share + share (range / z)^power exp(-beta_a z)`` of the light
+    in which J is its colour.
+    """
+
+    share: float
+    power: float
+    range: float
+    """In the unit of length that rates are per."""
+
+    def beam(
+        self,
+        beta_a: npt.NDArray[np.floating],  # [3] attenuation
+        z: npt.NDArray[np.floating],  # [...]
+    ) -> Array:
+        """[..., 3] light of the lamp on what is seen at range z."""
+        nearer = np.log(self.range) - np.log(np.maximum(z, NEAREST_LIT * self.range))
+        return np.asarray(
+            self.share * np.exp(self.power * nearer[..., None] - beta_a * z[..., None])
+        )
+
+    def light(
+        self,
+        beta_a: npt.NDArray[np.floating],  # [3] attenuation
+        z: npt.NDArray[np.floating],  # [...]
+    ) -> Array:
+        """[..., 3] all light on what is seen at range z, over that in which J is its colour."""
+        return 1.0 - self.share + self.beam(beta_a, z)
+
+    def rescale(self, times: float) -> Lamp:
+        """The same lamp in another unit of length, ``times`` of which are one of before."""
+        return replace(self, range=times * self.range)
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.water.model import Lamp, Model, Trial, WaterModel
-from aquaflow.water.mounting import START, MountedLight
+from aquaflow.water.model import Model, Trial, WaterModel
+from aquaflow.water.mounting import START, Lamp, MountedLight
 from aquaflow.water.observations import Observations
 from tests.water.water_observations import (
     B_RES,
