@@ -128,7 +128,7 @@ def deserialise(
     scene.sunlight.columns = int(facts.get("sunlight_columns", coarse))
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
     if facts.get("lamp") is not None:  # not in maps written before 2026-11-26
-        scene.lamp = Lamp(**facts["lamp"])
+        scene.lamp = Lamp.of(facts["lamp"])
     if "gain" in (facts.get("white_balance") or {}):  # not in maps written before 2026-11-22
         chosen = ChosenWhite(**facts.get("chosen_white", {}))  # not before 2026-11-27
         scene.balance = WhiteBalance(**facts["white_balance"], chosen=chosen)

@@ -19,7 +19,7 @@ Where little can be seen of it, the usual water is taken, with its uncertainty.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -28,7 +28,7 @@ import numpy.typing as npt
 from aquaflow.config import MediumConfig, WaterPriorsConfig
 from aquaflow.water.fit import WaterFit, descend
 from aquaflow.water.model import BELIEVED, RATE_ROWS, Model, WaterModel, rate_rows, with_lamp
-from aquaflow.water.mounting import Lamp
+from aquaflow.water.mounting import Lamp, places_of
 from aquaflow.water.nearest import Nearest, nearest_of, white_balance
 from aquaflow.water.normals import with_normals
 from aquaflow.water.observations import Observations, lightness_over_range, variance_over_range
@@ -175,7 +175,7 @@ def _estimate(
         trial.beta_a,
         trial.B_inf,
         trial.b,
-        trial.lamp,
+        None if trial.lamp is None else _as_it_is_known(trial.lamp, best),
         trial.glow,
         trial.unevenness,
         sigma,
@@ -195,6 +195,20 @@ def _as_pictures_show(best: WaterFit) -> Generator[None, None, WaterFit]:
     if not best.problem.model.lamp:
         return best
     return (yield from descend(best.problem.at_the_camera(best.x), best.x, best.noise))
+
+
+def _as_it_is_known(lamp: Lamp, lit: WaterFit) -> Lamp:
+    """The lamp, with its deviations and its places by the fit that knows its mounting."""
+    water = lit.problem
+    covariance = lit.repeated_covariance[water.lamp, water.lamp]
+    # The derivative of a share by its logit.
+    share_sigma = lamp.share * (1.0 - lamp.share) * float(np.sqrt(max(covariance[0, 0], 0.0)))
+    known = replace(lamp, share_sigma=share_sigma)
+    if not water.knows_mounting:
+        return known
+    places, sigma = places_of(lit.x[water.lamp][2:], covariance[2:, 2:])
+    mounted = replace(known, range=1.0, places=places, places_sigma=sigma)
+    return replace(mounted.rescale(water.median_range), range=lamp.range)
 
 
 def _may_have_lamp(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[None, None, bool]:

@@ -412,6 +412,11 @@ class WaterModel(WaterUnknowns):
             z = seen.z / seen.median_range
             self._mounted = MountedLight(seen.ray, seen.normal, z, self._basis)
 
+    @property
+    def knows_mounting(self) -> bool:
+        """Whether it has a lamp that may be elsewhere than at the camera."""
+        return self._mounted is not None
+
     def predict(
         self,
         x: Array,  # [K] parameters

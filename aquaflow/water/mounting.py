@@ -8,7 +8,9 @@ of the surface has: the ray on which it is seen, and its normal.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +55,32 @@ class Lamp:
     power: float
     range: float
     """In the unit of length that rates are per."""
+    share_sigma: float | None = None
+    """1 sigma of ``share``; None: not known, as in dives from before 2026-11-27."""
+    places: tuple[tuple[float, float], ...] | None = None
+    """How far right of and below the camera each of a pair is, in that unit; None: not known."""
+    places_sigma: tuple[float, float] | None = None
+    """1 sigma of both."""
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Lamp:
+        """The lamp that ``dataclasses.asdict`` made them of.
+
+        Raises:
+            KeyError, TypeError, ValueError: of these it did not.
+        """
+        share, power, reference = (float(facts[name]) for name in ("share", "power", "range"))
+        sigma, places, apart = (
+            facts.get(name) for name in ("share_sigma", "places", "places_sigma")
+        )
+        return cls(
+            share,
+            power,
+            reference,
+            None if sigma is None else float(sigma),
+            None if places is None else tuple(_pair(place) for place in places),
+            None if apart is None else _pair(apart),
+        )
 
     def beam(
         self,
@@ -75,7 +103,17 @@ class Lamp:
 
     def rescale(self, times: float) -> Lamp:
         """The same lamp in another unit of length, ``times`` of which are one of before."""
-        return replace(self, range=times * self.range)
+        changed = replace(self, range=times * self.range)
+        if self.places is None or self.places_sigma is None:
+            return changed
+        places = tuple((times * right, times * down) for right, down in self.places)
+        right, down = self.places_sigma
+        return replace(changed, places=places, places_sigma=(times * right, times * down))
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    right, down = (float(value) for value in values)
+    return right, down
 
 
 @dataclass(frozen=True)
@@ -100,6 +138,19 @@ class LampLight:
         """That of a lamp at the camera that shines everywhere."""
         nothing = np.zeros((len(START), beam.shape[1]))
         return cls(beam, nothing, glow, nothing)
+
+
+def places_of(
+    mounting: Array,  # [5]
+    covariance: Array,  # [5, 5]
+) -> tuple[tuple[tuple[float, float], ...], tuple[float, float]]:
+    """How far right of and below the camera each lamp is, and 1 sigma of both, over the median
+    range."""
+    aside = float(np.exp(min(mounting[2], MOST_LOG)))
+    right, down = mounting[3:].tolist()
+    variance = np.maximum(np.diag(covariance), 0.0)
+    sigma = np.sqrt([variance[3] + aside**2 * variance[2], variance[4]])
+    return ((right - aside, down), (right + aside, down)), (float(sigma[0]), float(sigma[1]))
 
 
 class MountedLight:
