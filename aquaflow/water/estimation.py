@@ -28,7 +28,7 @@ import numpy.typing as npt
 from aquaflow.config import MediumConfig, WaterPriorsConfig
 from aquaflow.water.fit import WaterFit, descend
 from aquaflow.water.model import BELIEVED, RATE_ROWS, Model, WaterModel, rate_rows, with_lamp
-from aquaflow.water.mounting import Lamp, places_of
+from aquaflow.water.mounting import SHARE_ERROR, Lamp, places_of
 from aquaflow.water.nearest import Nearest, nearest_of, white_balance
 from aquaflow.water.normals import with_normals
 from aquaflow.water.observations import Observations, lightness_over_range, variance_over_range
@@ -202,8 +202,8 @@ def _as_it_is_known(lamp: Lamp, lit: WaterFit) -> Lamp:
     water = lit.problem
     covariance = lit.repeated_covariance[water.lamp, water.lamp]
     # The derivative of a share by its logit.
-    share_sigma = lamp.share * (1.0 - lamp.share) * float(np.sqrt(max(covariance[0, 0], 0.0)))
-    known = replace(lamp, share_sigma=share_sigma)
+    share_sigma = lamp.share * (1.0 - lamp.share) * np.sqrt(max(covariance[0, 0], 0.0))
+    known = replace(lamp, share_sigma=float(np.hypot(share_sigma, SHARE_ERROR)))
     if not water.knows_mounting:
         return known
     places, sigma = places_of(lit.x[water.lamp][2:], covariance[2:, 2:])

@@ -32,6 +32,10 @@ CENTRE_SIGMA = 0.05
 START = np.array([CONE, LAMBERT, ASIDE, 0.0, 0.0])
 SIGMA = np.array([CONE_SIGMA, LAMBERT_SIGMA, ASIDE_SIGMA, CENTRE_SIGMA, CENTRE_SIGMA])
 """Of the numbers of a mounting, in the order above."""
+SHARE_ERROR, PLACE_ERROR = 0.06, np.array([0.06, 0.02])
+"""1 sigma that the model adds to what a fit states of the lamp's share, and of the lamps' places to
+the right and down, over the median range: root mean square errors on ten rendered dives with lamps,
+mapped, where the fit alone states a quarter of them: it is how ground faces them that it misses."""
 MOST_LOG = 3.0
 """Guards exponentials: of the cone's power and of the distance aside."""
 LEAST_COSINE = 0.01
@@ -149,7 +153,7 @@ def places_of(
     aside = float(np.exp(min(mounting[2], MOST_LOG)))
     right, down = mounting[3:].tolist()
     variance = np.maximum(np.diag(covariance), 0.0)
-    sigma = np.sqrt([variance[3] + aside**2 * variance[2], variance[4]])
+    sigma = np.sqrt([variance[3] + aside**2 * variance[2], variance[4]] + PLACE_ERROR**2)
     return ((right - aside, down), (right + aside, down)), (float(sigma[0]), float(sigma[1]))
 
 
