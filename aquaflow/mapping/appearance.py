@@ -114,10 +114,13 @@ def _daylight(mapper: Mapper, choice: str) -> Illuminant | None:
 
 @torch.no_grad()
 def doubt_of_daylight(mapper: Mapper, choice: str) -> str | None:
-    """A sentence where the light that the restored scene itself shows is hardly that of the
-    ``choice``, before it is chosen; None where it may be, or one of them is not known."""
+    """A sentence where lamps light the scene, or the light that the restored scene itself shows is
+    hardly that of the ``choice``, before it is chosen; None where it may be, or one of them is not
+    known."""
     _set_white(mapper.scene, ChosenWhite())
     said = _daylight(mapper, choice)
+    if said is not None and mapper.scene.lamp is not None:
+        return f"lamps light the scene, and {choice} is not their light's colour; choose {NEUTRAL}"
     shown = None if said is None else _looks(mapper, find_light=True).light
     if said is None or shown is None:
         return None
