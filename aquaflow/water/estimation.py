@@ -354,7 +354,7 @@ def _likeliest(
     _, problem, x = best
     # One channel may be stuck where its backscatter grows at once: tried from two sides.
     last = []
-    for start in (x, problem.start):
+    for start in (x, problem.start) if problem.model.water else (x,):
         last.append((yield from descend(problem, start, noise)))
     return max(last, key=lambda fit: fit.log_evidence)
 

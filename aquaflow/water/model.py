@@ -328,6 +328,8 @@ def gain_map(
     width: int,
 ) -> npt.NDArray[np.float32]:
     """g [H, W] at the pixel centres."""
+    if not coefficients.any():
+        return np.ones((height, width), np.float32)
     x = (np.arange(width) + 0.5) / (0.5 * width) - 1.0
     y = (np.arange(height) + 0.5) / (0.5 * height) - 1.0
     xy = np.stack(np.meshgrid(x, y), axis=-1)
