@@ -64,6 +64,32 @@ def contained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AQUAFLOW_STRICT", "0")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def defects_so_far() -> Iterator[list[str]]:
+    """Programming errors of ours that a stage contained since this list was emptied."""
+    from aquaflow.base.errors.failures import Failures
+
+    found, record = list[str](), Failures.record
+
+    def noted(self: Failures, stage: str, error: Exception, frame: int | None = None) -> None:
+        record(self, stage, error, frame)
+        found.extend(self.defects())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Failures, "record", noted)
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def contained_defects(defects_so_far: list[str]) -> Iterator[list[str]]:
+    """No test passes by containing a programming error of ours. One that plants some empties this
+    list of them at its end."""
+    yield defects_so_far
+    left = list(dict.fromkeys(defects_so_far))
+    defects_so_far.clear()
+    assert not left, left
+
+
 @pytest.fixture(scope="session")
 def aquaflow() -> Cli:
     """``aquaflow("map", source, "--out", dive)`` runs the command in a process of its own."""

@@ -18,7 +18,7 @@ from aquaflow.dive.map_file import read_map_file
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.restoration import mean_water
 from aquaflow.render import select_renderer
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 from tests.metric_scenes import metric_frame
 
 HASTY = Path(__file__).with_name("hasty.yaml")

@@ -48,8 +48,8 @@ WhiteBalanceOption = Annotated[
     str | None,
     typer.Option(
         help="Of colours without water: camera (as it saw what was nearest), neutral (the scene's "
-        "light is grey), daylight:TYPE (daylight at the dive's depth is, in Jerlov's water), or "
-        "FRAME:X,Y, a pixel that is grey; else as the dive was mapped."
+        "light is grey), daylight (that at the dive's depth is, in its water), daylight:TYPE (in "
+        "Jerlov's), or FRAME:X,Y, a pixel that is grey; else as the dive was mapped."
     ),
 ]
 

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from aquaflow.live.recorder.status import RecorderStatus
 
 POOR_RESULT = 3
-"""Exit code of a dive that was written but has warnings: hardly any poses, an empty map, or a
-calibration that does not fit."""
+"""Exit code of a dive that was written but has warnings: hardly any poses, an empty map, a
+calibration that does not fit, or a defect of ours."""
 
 MOST_SPLATS = 500_000
 """Gaussians of a finished dive that a browser gets: 7.6 MB, 6 s at 10 Mbit/s, of which the first

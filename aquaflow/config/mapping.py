@@ -76,8 +76,8 @@ class MediumConfig(StageConfig):
     white_balance: Annotated[str, AfterValidator(require_name)] = Field(
         CAMERA,
         description="of restored pictures: camera (as it saw what was nearest), neutral (the light "
-        "of the scene made grey), or daylight:TYPE (daylight at the dive's depth in water of "
-        "Jerlov's TYPE made grey); exports of a dive can have another",
+        "of the scene made grey), daylight (that at the dive's depth in its water made grey), or "
+        "daylight:TYPE (in water of Jerlov's TYPE); exports of a dive can have another",
     )
     initial_attenuation: Lab[float] = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 
 Rgb: TypeAlias = tuple[float, float, float]
 FloatArray: TypeAlias = npt.NDArray[np.floating]
@@ -44,8 +44,8 @@ class Medium:
     d: Rgb
     """Decay of the near residual, 1/m."""
     lamp: Lamp | None = None
-    """Light from beside the camera: its ``share``, ``power`` and ``range``; None where the dive
-    shows none."""
+    """Light from beside the camera: its ``share``, ``power`` and ``range``, and where it is; None
+    where the dive shows none."""
 
     def looking(
         self,
@@ -137,10 +137,10 @@ def lamp_of(facts: Mapping[str, Any]) -> Lamp | None:
     stated = facts.get("lamp")
     if stated is None:
         return None
-    share, power, reference = (float(stated[name]) for name in ("share", "power", "range"))
-    if not (0.0 <= share <= 1.0 and math.isfinite(power) and 0.0 < reference < math.inf):
+    lamp = Lamp.of(stated)
+    if not (0.0 <= lamp.share <= 1.0 and math.isfinite(lamp.power) and 0.0 < lamp.range < math.inf):
         raise DamagedError("the lamp is no share of light, power and range")
-    return Lamp(share, power, reference)
+    return lamp
 
 
 def _rgb(value: object) -> Rgb:

@@ -19,7 +19,7 @@ from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "
@@ -51,7 +51,7 @@ class WaterSummary:
     white_gain: list[float]
     """Of the clean radiance in restored pictures and map_clear.ply, in all."""
     white_choice: str
-    """``camera``, ``neutral``, ``daylight:TYPE``, or the ``FRAME:X,Y`` that is grey."""
+    """:attr:`aquaflow.water.white_balance.ChosenWhite.name`."""
     chosen_gain: list[float]
     """What of ``white_gain`` comes on top of the camera's white balance."""
     chosen_gain_sigma: list[float] | None

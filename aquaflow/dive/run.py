@@ -344,7 +344,8 @@ class DiveRun:
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()
             made.make(DeliverablePhase.REPORT, limits.whole, self._numbers(results, made))
-        numbers = self._numbers(results, made)  # the report's own time included
+        self.warnings = self._shortcomings()  # the report's own included, as its time is
+        numbers = self._numbers(results, made)
         attempt, write = self.slam.failures.attempt, self.folder.write_json
         attempt("writing metrics.json", partial(write, "metrics.json", numbers))
         if self._trace:
@@ -381,7 +382,7 @@ class DiveRun:
     def _shortcomings(self) -> list[str]:
         gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
         found = shortcomings(self.config, self.folder.rows, gaussians)
-        return found + self.calibration_warnings
+        return found + self.calibration_warnings + self.slam.failures.defects()
 
     @property
     def calibration_warnings(self) -> list[str]:

@@ -33,9 +33,9 @@ DARK = 0.02
 def show_in(dive: Dive, choice: str) -> None:
     """Show all restored colours of the dive's largest sub-map in a white balance from now on: that
     of the camera for what was nearest (``camera``), one in which the light of the restored scene is
-    grey (``neutral``), or daylight at the dive's depth in water of a type of Jerlov's
-    (``daylight:TYPE``), or a pixel of a mapped picture (``FRAME:X,Y``). Its files stay as they are.
-    Daylight that the scene itself contradicts is warned of.
+    grey (``neutral``), or daylight at the dive's depth in its own water (``daylight``) or in that
+    of a type of Jerlov's (``daylight:TYPE``), or a pixel of a mapped picture (``FRAME:X,Y``). Its
+    files stay as they are. Daylight that the scene itself contradicts is warned of.
 
     Raises:
         InputError: it is no white balance, there is no such pixel, the map shows nothing there, or
@@ -115,8 +115,8 @@ def _place(text: str) -> tuple[int, float, float]:
     except ValueError:
         pass
     raise InputError(
-        f"{text[:80]!r} is no white balance; give {CAMERA}, {NEUTRAL}, {DAYLIGHT}TYPE (such as "
-        f"{DAYLIGHT}oceanic_II), or FRAME:X,Y of something grey"
+        f"{text[:80]!r} is no white balance; give {CAMERA}, {NEUTRAL}, {DAYLIGHT}, "
+        f"{DAYLIGHT}:TYPE (such as {DAYLIGHT}:oceanic_II), or FRAME:X,Y of something grey"
     )
 
 

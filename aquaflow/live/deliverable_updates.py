@@ -272,7 +272,7 @@ class Interim:
             **dict.fromkeys(("psnr", "ssim", "lpips")),
             "heldout_frames": 0,
             "stage_ms": {},
-            "warnings": self._run.calibration_warnings,
+            "warnings": self._run.calibration_warnings + slam.failures.defects(),
             "calibration_check": self._run.calibration_numbers,
             "failures": slam.failures.to_json(),
             "version": __version__,

@@ -19,7 +19,7 @@ from aquaflow.mapping.restoration import mean_water, restored_own, was_restored
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
-from aquaflow.water.daylight import daylight_at
+from aquaflow.water.daylight import daylight_at, type_named, types_like
 from aquaflow.water.illuminant import (
     SCENE_ERROR,
     Illuminant,
@@ -101,19 +101,26 @@ def _illuminant_of(grey: Grey) -> Illuminant:
 def _daylight(mapper: Mapper, choice: str) -> Illuminant | None:
     """What a choice of daylight says of the light, in the camera's white balance."""
     balance, depths = mapper.scene.balance, mapper.depths
-    if balance is None or depths is None or not choice.startswith(DAYLIGHT):
+    water = mean_water(mapper.scene, mapper.views)
+    if not choice.startswith(DAYLIGHT) or balance is None or depths is None or water is None:
         return None
-    light = daylight_at(choice.removeprefix(DAYLIGHT), depths)
+    _, _, named = choice.partition(":")
+    sigma = balance.attenuation_sigma
+    types = type_named(named) if named else types_like(water_out(water.beta_a), sigma)
+    light = daylight_at(types, depths)
     log = light.log + np.log(balance.gain)
     return Illuminant(log - log.mean(), light.sigma)
 
 
 @torch.no_grad()
 def doubt_of_daylight(mapper: Mapper, choice: str) -> str | None:
-    """A sentence where the light that the restored scene itself shows is hardly that of the
-    ``choice``, before it is chosen; None where it may be, or one of them is not known."""
+    """A sentence where lamps light the scene, or the light that the restored scene itself shows is
+    hardly that of the ``choice``, before it is chosen; None where it may be, or one of them is not
+    known."""
     _set_white(mapper.scene, ChosenWhite())
     said = _daylight(mapper, choice)
+    if said is not None and mapper.scene.lamp is not None:
+        return f"lamps light the scene, and {choice} is not their light's colour; choose {NEUTRAL}"
     shown = None if said is None else _looks(mapper, find_light=True).light
     if said is None or shown is None:
         return None
@@ -163,8 +170,10 @@ def _looks(mapper: Mapper, find_light: bool) -> _Looks:
     said, weights = list[Array](), list[float]()
     for view in spread:
         shown = mapper.show(view)
-        own = restored_own(mapper.scene, view, shown)
-        if view.has_pixels and view.image.size:
+        has_picture = view.has_pixels and view.image.size > 0
+        if find_light or not has_picture:
+            own = restored_own(mapper.scene, view, shown)
+        if has_picture:
             samples.append(_in_picture(mapper.scene, view, shown))
         else:
             samples.append(seen_and_clear(view, shown, own))

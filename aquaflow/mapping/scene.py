@@ -21,7 +21,8 @@ from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
 from aquaflow.water.exposure import gain_of, learn_gain
 from aquaflow.water.medium import LearnedMedium, WaterParameters
-from aquaflow.water.model import TERMS, Lamp, gain_map
+from aquaflow.water.model import TERMS, gain_map
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.nearest import Nearest
 from aquaflow.water.open_sightings import light_of_ground, open_water
 from aquaflow.water.sightings import SOLID

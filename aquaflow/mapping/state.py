@@ -40,7 +40,7 @@ from aquaflow.render.dense_adam import STEP, DenseAdam
 from aquaflow.render.transfers import checkpoint_in, checkpoint_out, map_out
 from aquaflow.render.views import View
 from aquaflow.water.exposure import log_gains_of, set_log_gain
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.sightings import SOLID
 from aquaflow.water.sunlight import COLUMNS
 from aquaflow.water.tone import ShownTone, tone_of
@@ -128,7 +128,7 @@ def deserialise(
     scene.sunlight.columns = int(facts.get("sunlight_columns", coarse))
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
     if facts.get("lamp") is not None:  # not in maps written before 2026-11-26
-        scene.lamp = Lamp(**facts["lamp"])
+        scene.lamp = Lamp.of(facts["lamp"])
     if "gain" in (facts.get("white_balance") or {}):  # not in maps written before 2026-11-22
         chosen = ChosenWhite(**facts.get("chosen_white", {}))  # not before 2026-11-27
         scene.balance = WhiteBalance(**facts["white_balance"], chosen=chosen)

@@ -9,8 +9,9 @@ over wavelengths w, with K_d the diffuse attenuation of downwelling irradiance (
 Optics, 2nd edition, Elsevier 1976, Table XXVII; those of R. W. Austin and T. J. Petzold, Spectral
 dependence of the diffuse attenuation coefficient of light in ocean waters, Optical Engineering 25,
 1986, differ by up to a fifth). It is not the attenuation along a camera's ray, which is two to four
-times as large and needs no type: the map's own fit knows it. A channel is broad: at 10 m of oceanic
-II red has 1.9 times the light of its middle, because what is left of it is its yellow end.
+times as large; that one the map's own fit knows, and its ratios between the channels tell what type
+the water is. A channel is broad: at 10 m of oceanic II red has 1.9 times the light of its middle,
+because what is left of it is its yellow end.
 """
 
 from __future__ import annotations
@@ -49,7 +50,15 @@ Jiang et al., What is the space of spectral sensitivity functions for digital co
 RESPONSE_ERROR = 0.2
 """1 sigma of a log for its size: deviations of 20 and 40 nm instead of 30 change red by 0.1 to 0.3
 of it down to 20 m, and how a picture is encoded by a tenth."""
+RATIO_ERROR = 0.2
+"""1 sigma of the log of a channel: attenuation along a ray over K_d, but for the factor that all
+channels have in common. Ratios of Li et al. (2020), which the synthetic waters have, differ from
+Jerlov's by 0.07 to 0.23 (root mean square of the three channels)."""
+RAY_M = 4.0
+"""Length of way on which types are compared: ratios change by a tenth from 0.5 to 8 m."""
 FINE_NM = np.arange(400.0, 701.0, 5.0)
+LEAST = 1e-6
+"""Guards the logarithm of an attenuation."""
 DEEPEST_M = 200.0
 """Guards the logarithm; there is no daylight for a camera below."""
 ENCODING = 1.0 / 2.2
@@ -66,28 +75,52 @@ class Depths:
     """Standard deviation."""
 
 
-def daylight_at(water: str, depths: Depths) -> Illuminant:
-    """The colour of daylight in ``water``, one of ``JERLOV_TYPES``, as a camera that takes surface
-    daylight for white encodes it. It is as sure as half of the way to the neighbouring types, as
-    the dive's depths differ, and as cameras do.
+def type_named(water: str) -> Array:
+    """[10] how likely each of ``JERLOV_TYPES`` is: the one of that name for certain.
 
     Raises:
         ValueError: there is no such type.
     """
-    number = JERLOV_TYPES.index(water)
+    return np.asarray(np.eye(len(JERLOV_TYPES))[JERLOV_TYPES.index(water)])
+
+
+def types_like(
+    beta_a: Array,  # [3] attenuation along a ray, in any unit
+    sigma: float,  # its relative deviation
+) -> Array:
+    """[10] how likely each of ``JERLOV_TYPES`` is, by the ratios of the attenuations."""
+    off = np.log(np.maximum(beta_a, LEAST)) - np.log(-_log_light(RAY_M))
+    off -= off.mean(axis=1, keepdims=True)
+    likely = np.exp(-0.5 * (off**2).sum(axis=1) / (sigma**2 + RATIO_ERROR**2))
+    return np.asarray(likely / likely.sum())
+
+
+def daylight_at(
+    types: Array,  # [10] how likely each of JERLOV_TYPES is
+    depths: Depths,
+) -> Illuminant:
+    """The mean colour of daylight in such waters, as a camera that takes surface daylight for white
+    encodes it. It is as sure as the likely types agree, as half of the way to their neighbours, as
+    the dive's depths differ, and as cameras do."""
     depth = max(depths.mean_m, 0.0)
     logs = _logs(depth)
-    of_type = 0.5 * np.gradient(logs, axis=0)[number]
-    of_depths = _logs(depth + depths.spread_m)[number] - logs[number]
-    of_camera = RESPONSE_ERROR * logs[number]
-    return Illuminant(logs[number], np.sqrt(of_type**2 + of_depths**2 + of_camera**2))
+    of_neighbours = 0.5 * np.gradient(logs, axis=0)
+    log = types @ logs
+    of_types = types @ ((logs - log) ** 2 + of_neighbours**2)
+    of_depths = types @ _logs(depth + depths.spread_m) - log
+    of_camera = RESPONSE_ERROR * log
+    return Illuminant(log, np.sqrt(of_types + of_depths**2 + of_camera**2))
 
 
 def _logs(depth_m: float) -> Array:
     """[10, 3] logarithms of RGB as encoded, of mean 0, by type."""
+    log = ENCODING * _log_light(min(depth_m, DEEPEST_M))
+    return np.asarray(log - log.mean(axis=1, keepdims=True))
+
+
+def _log_light(way_m: float) -> Array:
+    """[10, 3] logarithm of the share of RGB that is left after so much water, by type."""
     response = np.exp(-0.5 * ((FINE_NM - CHANNELS_NM[:, None]) / CHANNEL_SIGMA_NM) ** 2)
     response /= response.sum(axis=1, keepdims=True)
     of_types = [np.interp(FINE_NM, WAVELENGTHS_NM, row) for row in K_D]
-    light = np.exp(-np.stack(of_types) * min(depth_m, DEEPEST_M)) @ response.T
-    log = ENCODING * np.log(light)
-    return np.asarray(log - log.mean(axis=1, keepdims=True))
+    return np.asarray(np.log(np.exp(-np.stack(of_types) * way_m) @ response.T))

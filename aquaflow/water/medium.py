@@ -18,7 +18,8 @@ from torch import Tensor, nn
 
 from aquaflow.config import MediumConfig
 from aquaflow.render.water import BANDS, MAX_OPTICAL_DEPTH, sinusoidal_encoding
-from aquaflow.water.model import NEAREST_LIT, TERMS, Lamp
+from aquaflow.water.model import TERMS
+from aquaflow.water.mounting import NEAREST_LIT, Lamp
 
 MIN_RATE = 1e-4
 """1 / map unit; a rate of zero has no finite parameter."""

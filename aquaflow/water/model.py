@@ -18,9 +18,9 @@ from typing_extensions import Self
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.water import mounting
-from aquaflow.water.beliefs import beliefs
-from aquaflow.water.mounting import LampLight, MountedLight
-from aquaflow.water.observations import Observations, RegionalColours
+from aquaflow.water.beliefs import RegionalColours, beliefs
+from aquaflow.water.mounting import Lamp, LampLight, MountedLight
+from aquaflow.water.observations import Observations
 
 # --------------------------------------------------------------------------------------------------
 # What may lie between a surface point's colour and the picture's, as one vector of numbers.
@@ -122,47 +122,6 @@ class Model:
 def with_lamp(models: Sequence[Model]) -> list[Model]:
     """The same with a lamp, of those in water; most backscatter is the lamp's then, and even."""
     return [replace(model, lamp=True) for model in models if model.water and not model.uneven]
-
-
-@dataclass(frozen=True)
-class Lamp:
-    """Light from beside the camera on top of the light that is everywhere.
-
-    What is seen at range z gets ``1 - share + share (range / z)^power exp(-beta_a z)`` of the light
-    in which J is its colour.
-    """
-
-    share: float
-    power: float
-    range: float
-    """In the unit of length that rates are per."""
-
-    def beam(
-        self,
-        beta_a: npt.NDArray[np.floating],  # [3] attenuation
-        z: npt.NDArray[np.floating],  # [...]
-    ) -> Array:
-        """[..., 3] light of the lamp on what is seen at range z."""
-        nearer = np.log(self.range) - np.log(np.maximum(z, NEAREST_LIT * self.range))
-        return np.asarray(
-            self.share * np.exp(self.power * nearer[..., None] - beta_a * z[..., None])
-        )
-
-    def light(
-        self,
-        beta_a: npt.NDArray[np.floating],  # [3] attenuation
-        z: npt.NDArray[np.floating],  # [...]
-    ) -> Array:
-        """[..., 3] all light on what is seen at range z, over that in which J is its colour."""
-        return 1.0 - self.share + self.beam(beta_a, z)
-
-    def rescale(self, times: float) -> Lamp:
-        """The same lamp in another unit of length, ``times`` of which are one of before."""
-        return replace(self, range=times * self.range)
-
-
-NEAREST_LIT = 0.1
-"""Share of a lamp's reference range up to which its light is the same: nothing is seen so near."""
 
 
 @dataclass(frozen=True)
@@ -369,6 +328,8 @@ def gain_map(
     width: int,
 ) -> npt.NDArray[np.float32]:
     """g [H, W] at the pixel centres."""
+    if not coefficients.any():
+        return np.ones((height, width), np.float32)
     x = (np.arange(width) + 0.5) / (0.5 * width) - 1.0
     y = (np.arange(height) + 0.5) / (0.5 * height) - 1.0
     xy = np.stack(np.meshgrid(x, y), axis=-1)
@@ -452,6 +413,11 @@ class WaterModel(WaterUnknowns):
         if model.lamp and seen.ray is not None and seen.normal is not None:
             z = seen.z / seen.median_range
             self._mounted = MountedLight(seen.ray, seen.normal, z, self._basis)
+
+    @property
+    def knows_mounting(self) -> bool:
+        """Whether it has a lamp that may be elsewhere than at the camera."""
+        return self._mounted is not None
 
     def predict(
         self,

@@ -155,7 +155,7 @@ def light_of_ground(
 ) -> Image:
     """[H, W] what usual ground there would return, mean of RGB; infinite where no range is known:
     what has no texture there is no ground."""
-    light = (T * mean).mean(axis=-1)
+    light = T @ (mean / 3.0)
     return np.where(solid, light, np.inf).astype(np.float32)
 
 

@@ -18,7 +18,6 @@ from collections.abc import Generator, Sequence
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.geometry.camera import CameraModel
@@ -44,14 +43,6 @@ SIGMA_PX = 2.0
 """Of a patch in the farthest of its views, standard deviation of the Gaussian that weighs it."""
 SIDE, REACH = 5, 2.0
 """Samples along a side of the patch's grid, and how many sigmas it reaches to each side."""
-SURFACE, NEIGHBOURS, ROUNDS = 20_000, 240, 4
-"""Places that normals are fitted to, those nearest to a patch, and how often the plane through them
-is fitted anew. Half to an eighth of them on ten rendered dives with lamps: the noise of the map's
-ranges hides how patches face a lamp, and the stated deviations are too small."""
-PLACES_AT_ONCE = 50
-"""Between two pauses: their planes take 5 ms."""
-TINY = 1e-9
-"""Guards a division where the surface is flat."""
 SEEN_SHARE = 0.85
 """Of a patch's samples that a view must show."""
 CLIPPED = 0.9
@@ -72,8 +63,7 @@ def sighting(
     yield
     samples, sigma = _patches(pictures, places, ranges)
     yield
-    normals = yield from _normals(pictures, places, random)
-    colour, z, xy, ray, normal = (np.zeros((*ranges.shape, size)) for size in (3, 1, 2, 3, 3))
+    colour, z, xy, ray = (np.zeros((*ranges.shape, size)) for size in (3, 1, 2, 3))
     whole_patches = np.asarray(np.isfinite(samples).all(axis=(1, 2)))
     seen = np.isfinite(ranges) & whole_patches[:, None]
     for number, picture in enumerate(pictures):
@@ -81,7 +71,7 @@ def sighting(
         *found, whole = _observe(picture, samples[own], sigma[own])
         for table, values in zip((colour, z, xy), found, strict=True):
             table[own, number] = values
-        ray[own, number], normal[own, number] = picture.directions(places[own], normals[own])
+        ray[own, number] = picture.rays_to(places[own])
         seen[own, number] = whole
         if number % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
             yield
@@ -96,7 +86,6 @@ def sighting(
         xy[place, view],
         places[used],
         ray[place, view],
-        normal[place, view],
     )
 
 
@@ -156,40 +145,6 @@ def _patches(
         whole &= colours.mean(axis=-1).std(axis=1) > LEAST_TEXTURE
         samples[own[whole]] = lifted[whole]
     return samples, sigma
-
-
-def _normals(
-    pictures: Sequence[PosedPicture],
-    places: Array,  # [P, 3] world
-    random: np.random.Generator,
-) -> Generator[None, None, Array]:
-    """[P, 3] unit, world: of the planes that fit the surface around best, what stands out left
-    out; with pauses."""
-    each = -(-SURFACE // max(len(pictures), 1))
-    surface = np.concatenate(
-        [np.zeros((0, 3)), *(picture.random_surface(each, random) for picture in pictures)]
-    )
-    yield
-    surface = surface[np.isfinite(surface).all(axis=1)]
-    normals, count = np.zeros_like(places), min(NEIGHBOURS, len(surface))
-    if count == 0:
-        return normals
-    tree = KDTree(surface)
-    yield
-    for first in range(0, len(places), PLACES_AT_ONCE):
-        some = slice(first, first + PLACES_AT_ONCE)
-        around = surface[tree.query(places[some], count)[1].reshape(-1, count)]
-        share = np.full(around.shape[:2], 1.0 / count)
-        for _ in range(ROUNDS):
-            off = around - np.einsum("nk,nki->ni", share, around)[:, None]
-            scatter = np.einsum("nk,nki,nkj->nij", share, off, off)
-            normals[some] = np.linalg.eigh(scatter)[1][:, :, 0]
-            away = np.abs(np.einsum("nki,ni->nk", off, normals[some]))
-            usual = 1.5 * np.median(away, axis=1, keepdims=True) + TINY
-            share = 1.0 / (1.0 + (away / usual) ** 2)
-            share /= share.sum(axis=1, keepdims=True)
-        yield
-    return normals
 
 
 def _observe(
@@ -314,18 +269,13 @@ class PosedPicture:
         there = np.abs(self._z[rows, columns] - z) < AGREEING * z
         return pixels, z, ahead & inside & there & self._solid[rows, columns]
 
-    def directions(
+    def rays_to(
         self,
         places: Array,  # [N, 3] world
-        normals: Array,  # [N, 3] world, unit, on either side
-    ) -> tuple[Array, Array]:
-        """The rays on which places are seen and the normals that face the camera, both [N, 3],
-        unit, camera axes."""
+    ) -> Array:
+        """[N, 3] unit, camera axes."""
         ray = (places - self.T_wc.t) @ self.T_wc.R
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        normal = normals @ self.T_wc.R
-        normal *= -np.sign((ray * normal).sum(axis=1, keepdims=True))
-        return ray, normal
+        return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
     def sample(
         self,

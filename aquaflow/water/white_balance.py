@@ -77,7 +77,8 @@ class ChosenWhite:
     """A white balance that was asked for, on top of the camera's."""
 
     name: str = CAMERA
-    """``camera``, ``neutral``, ``daylight:TYPE`` or the ``FRAME:X,Y`` that was said to be grey."""
+    """``camera``, ``neutral``, ``daylight``, ``daylight:TYPE``, or the ``FRAME:X,Y`` that is
+    grey."""
     gain: Rgb = (1.0, 1.0, 1.0)
     """RGB; the scene's mean luminance stays."""
     sigma: Rgb | None = None

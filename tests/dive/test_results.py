@@ -24,7 +24,7 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped, Frame
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 

@@ -31,6 +31,7 @@ from aquaflow.render.contract import radiance
 from aquaflow.survey.viewer.finished import in_chosen_white
 from aquaflow.survey.viewer.seen_water import water_of
 from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.water.mounting import Lamp
 from tests.mapping.grey_floor import CAST, mapped
 from tests.water.daylit import daylit_grey
 
@@ -87,6 +88,19 @@ def test_daylight_that_the_scene_contradicts_is_warned_of(
     show_in(Dive(dive), "daylight:oceanic_II")
     (said,) = caplog.messages
     assert "sigma from the light that the scene itself shows" in said
+
+
+def test_daylight_where_lamps_light_the_scene_is_warned_of(
+    dive: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mapper = mapped(light=daylit_grey(DEPTH_M))
+    mapper.scene.lamp = Lamp(share=0.7, power=2.0, range=1.5)
+    write_map_file(dive / "map.aqf", mapper)
+    row = PoseRow(0, 0.0, None, 0, 0.0, 0.0, 0.0, "m", depth_m=DEPTH_M)
+    write_trajectory_csv(dive / TRAJECTORY_CSV, [row])
+    show_in(Dive(dive), "daylight")
+    (said,) = caplog.messages
+    assert said.startswith("lamps light the scene, and daylight is not their light's colour")
 
 
 def test_a_scene_by_daylight_of_a_depth_becomes_grey(
@@ -171,8 +185,9 @@ def test_a_browser_shows_the_white_balance_that_was_chosen_and_knows_that_of_the
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ("sepia", "'sepia' is no white balance; give camera, neutral, daylight:TYPE .*, or FRAME"),
+        ("sepia", "'sepia' is no white balance; give camera, neutral, daylight, daylight:T"),
         ("daylight:4D", "'daylight:4D' names no water type .* oceanic_I, .*, coastal_9C"),
+        ("daylight", "no depth below the surface.*map it with --telemetry"),
         ("daylight:oceanic_II", "no depth below the surface.*map it with --telemetry"),
         ("1:3", "is no white balance"),
         ("x:3,4", "is no white balance"),

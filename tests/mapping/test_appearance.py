@@ -30,7 +30,7 @@ from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.daylight import Depths
 from aquaflow.water.illuminant import LUMINANCE
 from aquaflow.water.tone import ShownTone, lightness
-from tests.mapping.grey_floor import CAST, mapped
+from tests.mapping.grey_floor import CAST, WATER, mapped
 from tests.mapping.mapping_scenes import CAMERA, renderer, view_of
 from tests.water.daylit import daylit_grey
 
@@ -84,6 +84,20 @@ def test_daylight_chosen_by_the_settings_waits_for_a_depth() -> None:
     assert mapper.scene.balance.chosen.name == "daylight:oceanic_II"
     after = restored_of(mapper).mean(axis=0)
     assert after.max() / after.min() < 1.1
+
+
+def test_daylight_of_no_named_water_goes_by_the_waters_own_attenuation() -> None:
+    gains = []
+    for rates in ((0.49, 0.17, 0.14), (0.88, 0.69, 0.88)):  # as oceanic II, as coastal 5C
+        mapper = mapped("daylight", light=daylit_grey(12.0))
+        assert mapper.scene.balance is not None
+        mapper.medium.set_water(torch.tensor(rates), *(torch.tensor(each) for each in WATER[1:]))
+        mapper.depths = Depths(12.0, 0.5)
+        shown_tone(mapper)
+        assert mapper.scene.balance.chosen.name == "daylight"
+        gains.append(mapper.scene.balance.chosen.gain)
+    red_over_blue = [red / blue for red, _, blue in gains]
+    assert red_over_blue[0] > 1.3 * red_over_blue[1]
 
 
 def test_a_channel_that_daylight_left_nothing_of_is_not_amplified() -> None:

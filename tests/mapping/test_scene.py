@@ -17,7 +17,7 @@ from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
 from aquaflow.mapping.state import deserialise, serialise
 from aquaflow.render.reference import ReferenceRenderer
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.white_balance import ChosenWhite
 from tests.mapping.mapping_scenes import (
     fit_water,

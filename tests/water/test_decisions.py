@@ -7,12 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aquaflow.water.observations import (
-    FEWEST,
-    RegionalColours,
-    lightness_over_range,
-    regions_of,
-)
+from aquaflow.water.beliefs import RegionalColours
+from aquaflow.water.observations import FEWEST, lightness_over_range, regions_of
 from tests.water.decision_table import kinds, row
 from tests.water.simulated_dives import Kind, dive
 from tests.water.water_observations import fitted, sighted

@@ -14,12 +14,11 @@ from aquaflow.water.estimation import (
     EVERY_MODEL,
     MIN_POINTS,
     WaterEstimate,
-    cost,
-    descend,
     estimating,
     models_for,
     without,
 )
+from aquaflow.water.fit import cost, descend
 from aquaflow.water.model import TERMS, Model, WaterModel, shading_basis
 from aquaflow.water.observations import Observations, run_to_end
 from tests.water.water_observations import (

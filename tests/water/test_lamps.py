@@ -11,7 +11,8 @@ import torch
 
 from aquaflow.water.estimation import EVERY_MODEL, Model, WaterModel, with_lamp
 from aquaflow.water.medium import WaterParameters
-from aquaflow.water.model import Lamp, Trial
+from aquaflow.water.model import Trial
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.observations import Observations
 from tests.water.water_observations import (
     B_RES,

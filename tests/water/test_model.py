@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.water.estimation import normal_equations
+from aquaflow.water.fit import normal_equations
 from aquaflow.water.model import EXPOSURE_SIGMA, TERMS, Model, WaterModel
 from aquaflow.water.observations import Observations
 from tests.water.water_observations import B_RES, D

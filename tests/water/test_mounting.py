@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.water.model import Lamp, Model, Trial, WaterModel
-from aquaflow.water.mounting import START, MountedLight
+from aquaflow.water.model import Model, Trial, WaterModel
+from aquaflow.water.mounting import START, Lamp, MountedLight
 from aquaflow.water.observations import Observations
 from tests.water.water_observations import (
     B_RES,
@@ -66,6 +67,31 @@ def test_pictures_that_know_no_normals_are_restored_evenly_over_range() -> None:
     assert found.lightness_over_range is not None
     assert found.lightness_over_range[0] < 0.7
     assert found.lightness_over_range[1] == pytest.approx(1.0, abs=0.05)
+
+
+def test_where_lamps_are_is_known_with_its_deviation() -> None:
+    seen = on_sloping_ground()
+    lamp = fitted(seen).lamp
+    assert lamp is not None
+    assert lamp.places is not None
+    assert lamp.places_sigma is not None
+    aside, right, down = np.exp(MOUNTING[2]), *MOUNTING[3:]
+    true = seen.median_range * np.array([[right - aside, down], [right + aside, down]])
+    assert (np.abs(lamp.places - true) < 3.0 * np.array(lamp.places_sigma)).all()
+    assert max(lamp.places_sigma) < 0.1 * seen.median_range
+    assert lamp.share_sigma is not None
+    assert 0.0 < lamp.share_sigma < 0.1
+
+
+def test_a_lamp_is_read_as_it_was_written_and_its_lengths_change_their_unit() -> None:
+    places = ((-0.2, 0.1), (0.2, 0.1))
+    lamp = Lamp(0.8, 2.0, 1.5, share_sigma=0.02, places=places, places_sigma=(0.03, 0.01))
+    assert Lamp.of(json.loads(json.dumps(asdict(lamp)))) == lamp
+    twice = Lamp(0.8, 2.0, 3.0, 0.02, ((-0.4, 0.2), (0.4, 0.2)), (0.06, 0.02))
+    assert lamp.rescale(2.0) == twice
+    older = {"share": 0.8, "power": 2.0, "range": 1.5}
+    assert Lamp.of(older) == Lamp(0.8, 2.0, 1.5)
+    assert Lamp.of(older).rescale(2.0).places is None
 
 
 def test_a_lamp_at_the_camera_that_shines_everywhere_changes_nothing() -> None:

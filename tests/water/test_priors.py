@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.water.beliefs import BRIGHT_LEVEL, DARK_LEVEL, beliefs
-from aquaflow.water.estimation import cost, normal_equations, weights
+from aquaflow.water.fit import cost, normal_equations, weights
 from aquaflow.water.model import Model, WaterModel
 from tests.water.water_observations import B_RES, D, sighted
 

@@ -11,6 +11,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water import sightings
+from aquaflow.water.normals import with_normals
 from aquaflow.water.observations import Observations, run_to_end
 from aquaflow.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, PosedPicture, sighting
 
@@ -49,6 +50,13 @@ def looked(pictures: list[PosedPicture]) -> Observations:
     return run_to_end(sighting(pictures, np.random.default_rng(0)))
 
 
+def facing(pictures: list[PosedPicture]) -> tuple[Observations, Array]:
+    """What is looked at, and its normals."""
+    seen = run_to_end(with_normals(looked(pictures), pictures))
+    assert seen.normal is not None
+    return seen, seen.normal
+
+
 def test_a_patch_has_the_same_colour_from_near_and_far() -> None:
     seen = looked([wall_picture(centre) for centre in BACKING])
     assert seen.points > 400
@@ -72,13 +80,12 @@ def test_range_and_place_are_those_of_the_patch() -> None:
 
 
 def test_rays_and_normals_are_in_camera_axes_and_normals_face_the_camera() -> None:
-    seen = looked([wall_picture(centre) for centre in BACKING])
+    seen, normal = facing([wall_picture(centre) for centre in BACKING])
     assert seen.ray is not None
-    assert seen.normal is not None
     local = seen.positions[seen.point] - np.array(BACKING)[seen.view]
     expected = local / np.linalg.norm(local, axis=1, keepdims=True)
     np.testing.assert_allclose(seen.ray, expected, atol=1e-6)
-    np.testing.assert_allclose(seen.normal, np.tile([0.0, 0.0, -1.0], (len(seen.z), 1)), atol=0.02)
+    np.testing.assert_allclose(normal, np.tile([0.0, 0.0, -1.0], (len(seen.z), 1)), atol=0.02)
 
 
 def test_what_stands_out_of_a_surface_does_not_turn_its_normals() -> None:
@@ -87,9 +94,8 @@ def test_what_stands_out_of_a_surface_does_not_turn_its_normals() -> None:
         z = ranges_of_the_wall(centre)
         z[50:54, 76:80] *= 0.97
         bumped.append(wall_picture(centre, ranges=z))
-    seen = looked(bumped)
-    assert seen.normal is not None
-    assert np.quantile(-seen.normal[:, 2], 0.05) > 0.995
+    _, normal = facing(bumped)
+    assert np.quantile(-normal[:, 2], 0.05) > 0.995
 
 
 def test_observations_come_by_point_and_a_point_is_seen_once_in_a_view() -> None:

@@ -184,8 +184,13 @@ class Failures:
         ]
 
     def notes(self) -> list[str]:
-        """A line for each kind."""
-        return [kind.note() for kind in self.kinds]
+        """A line for each kind that is no programming error of ours."""
+        return [kind.note() for kind in self.kinds if not kind.defect]
+
+    def defects(self) -> list[str]:
+        """A line for each that is one: what its stage would have found is missing from every dive
+        like this one."""
+        return [kind.note() for kind in self.kinds if kind.defect]
 
     def to_json(self) -> list[dict[str, Any]]:
         """The failures as metrics.json has them: an object for each kind."""

@@ -14,6 +14,7 @@ from aquaflow.dive.point_cloud import PointCloud
 from aquaflow.dive.ros.topics import FrameTransform, constant, message
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.water.mounting import Lamp
 
 Array = npt.NDArray[np.float64]
 
@@ -195,6 +196,26 @@ def status(level: int, name: str, said: str, values: Mapping[str, object]) -> An
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=level, name=name, message=said, hardware_id="aquaflow", values=pairs,
     )  # fmt: skip
+
+
+def lamp_values(lamp: Lamp | None, unit: str) -> dict[str, object]:
+    """Values of a status of what is known of the vehicle's lamps, lengths in ``unit``."""
+    if lamp is None:
+        return {}
+    values: dict[str, object] = {
+        f"lamps, share of the light at {lamp.range:.3g} {unit}": lamp.share
+    }
+    if lamp.share_sigma is not None:
+        values["lamps, 1 sigma of the share"] = lamp.share_sigma
+    if lamp.places is not None and lamp.places_sigma is not None:
+        for number, place in enumerate(lamp.places, 1):
+            values[f"lamp {number} right of and below the camera, {unit}"] = _few_digits(place)
+        values[f"lamps, 1 sigma of the places, {unit}"] = _few_digits(lamp.places_sigma)
+    return values
+
+
+def _few_digits(lengths: Sequence[float]) -> str:
+    return ", ".join(f"{length:.3g}" for length in lengths)
 
 
 def diagnostics(t_ns: int, statuses: Sequence[Any]) -> Any:

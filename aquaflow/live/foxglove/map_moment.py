@@ -90,11 +90,13 @@ def water_status(water: WaterParameters | None, frame: WorldFrame) -> Any:
         return messages.status(messages.OK, name, "no water is modelled", {})
     per = "1/m" if frame.metric else "1/map unit"
     rates = {"attenuation": water.beta_a, "b": water.b, "d": water.d}
-    values = {}
+    values: dict[str, object] = {}
     for key, tensor in rates.items():
         for channel, value in zip(messages.CHANNELS, picture_out(tensor), strict=True):
             values[f"{key} {channel}, {per}"] = f"{value / frame.T_nm.scale:.6g}"
     for key, tensor in {"B_inf": water.B_inf, "B_res": water.B_res}.items():
         for channel, value in zip(messages.CHANNELS, picture_out(tensor), strict=True):
             values[f"{key} {channel}"] = f"{value:.6g}"
+    lamp = water.lamp and water.lamp.rescale(frame.T_nm.scale)
+    values |= messages.lamp_values(lamp, per.removeprefix("1/"))
     return messages.status(messages.OK, name, "parameters of the image formation", values)

@@ -20,6 +20,7 @@ from aquaflow.dive.deliverables import (
     start_ns,
 )
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.medium import lamp_of
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.point_cloud import read_point_cloud
 from aquaflow.dive.restored import SeenFrame, seen_frames, tone_without_water, without_water
@@ -177,6 +178,7 @@ def _water_status(medium: dict[str, Any]) -> Any:
         per = "" if key.startswith("B_") else f", {unit}"
         for channel, value in zip(messages.CHANNELS, numbers, strict=True):
             values[f"{key} {channel}{per}"] = f"{value:.6g}"
+    values |= messages.lamp_values(lamp_of(medium), unit.removeprefix("1/"))
     return messages.status(messages.OK, name, "parameters of the image formation", values)
 
 

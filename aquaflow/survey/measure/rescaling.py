@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from aquaflow.survey.measure.notes import read_notes, scale_notes, write_notes
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import LARGEST_SCALE_SIGMA, SourceReport, WorldFrame
+from aquaflow.water.mounting import Lamp
 
 Array = npt.NDArray[np.float64]
 
@@ -160,7 +161,7 @@ def _medium(data: dict[str, Any], frame: WorldFrame, times: float) -> dict[str, 
     for name, of in (ranges | {"near_range": data["restored"]}).items():
         of[name] = None if of[name] is None else times * of[name]
     if data.get("lamp") is not None:  # absent in dives before 2026-11-26
-        data["lamp"]["range"] *= times
+        data["lamp"] = asdict(Lamp.of(data["lamp"]).rescale(times))
     data["attenuation_unit"] = data["units"]["attenuation, b, d"] = "1/m"
     return data
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from aquaflow.dive.medium import Rgb
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.telemetry.world_frame import SourceReport
+from aquaflow.water.mounting import Lamp
 
 FocalSource = Literal["calibrated", "guessed", "refined"]
 
@@ -109,6 +110,8 @@ class MediumCurves:
     sigma of that; None: the camera's."""
     lightness: tuple[float, float] | None = None
     """L* of the same ground, far over near: as the camera saw it, and restored."""
+    lamp: Lamp | None = None
+    """Light from beside the camera; None where none was found."""
 
 
 @dataclass(frozen=True)

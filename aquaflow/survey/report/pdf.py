@@ -106,7 +106,7 @@ def _water(pages: Pages, data: ReportData) -> None:
     pages.drawing(WATER_IN, medium_axes, data.medium)
     rows = [("", *sections.RGB), *sections.water_rows(data.medium)]
     pages.table(rows)
-    pages.paragraph(sections.visibility_words(data.medium))
+    pages.paragraph(sections.visibility_words(data.medium) + sections.lamp_words(data.medium))
 
 
 def _examples(pages: Pages, data: ReportData) -> None:

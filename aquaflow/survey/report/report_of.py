@@ -14,7 +14,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.medium import NAME as MEDIUM
-from aquaflow.dive.medium import Rgb
+from aquaflow.dive.medium import Rgb, lamp_of
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
@@ -107,12 +107,13 @@ def _medium(dive: Dive) -> MediumCurves | None:
         span = float(content["range_p5"]), float(content["range_p95"])
         white = _white(content.get("restored"))
         light = content.get("lightness_over_range")
+        lamp = lamp_of(content)
         lightness = None if light is None else (float(light["seen"]), float(light["restored"]))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{dive.file(MEDIUM)} is damaged; map the dive again") from error
     return MediumCurves(
         beta, b, B_inf, B_res, d, *span,
-        unit=dive.frame.unit, white=white, lightness=lightness,
+        unit=dive.frame.unit, white=white, lightness=lightness, lamp=lamp,
     )  # fmt: skip
 
 

@@ -372,7 +372,7 @@ def water(data: MediumCurves | None) -> str:
         + "</tr>"
         for name, *values in water_rows(data)
     )
-    seen = visibility_words(data) + lightness_words(data)
+    seen = visibility_words(data) + lightness_words(data) + lamp_words(data)
     return _survey_section(
         "The water in numbers", said, f'<table>{head}{body}</table><p class="after">{seen}</p>'
     )
@@ -423,6 +423,27 @@ def lightness_words(data: MediumCurves) -> str:
     return (
         f" Ground seen from near and far is {seen:.0%} as light (CIELAB L*) from far as the camera "
         f"saw it, {restored:.0%} without the water."
+    )
+
+
+def lamp_words(data: MediumCurves) -> str:
+    """The vehicle's lamps, in a sentence; none where none were found."""
+    lamp = data.lamp
+    if lamp is None:
+        return ""
+    by = "" if lamp.share_sigma is None else f" \u00b1 {lamp.share_sigma:.0%}"
+    unit = html.escape(data.unit)
+    said = (
+        f" Lamps light the scene: {lamp.share:.0%}{by} of the light is theirs at {lamp.range:.2g} "
+        f"{unit}, but for the water's loss on the way there"
+    )
+    if lamp.places is None or lamp.places_sigma is None:
+        return said + "."
+    places = " and ".join(f"({right:.2f}, {down:.2f})" for right, down in lamp.places)
+    right, down = lamp.places_sigma
+    return (
+        f"{said}. They are {places} {unit} right of and below the camera, \u00b1 ({right:.2f}, "
+        f"{down:.2f})."
     )
 
 

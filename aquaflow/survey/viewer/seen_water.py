@@ -9,7 +9,7 @@ import numpy as np
 
 from aquaflow.base.errors import DamagedError
 from aquaflow.dive.medium import lamp_of
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 
 RGB = tuple[float, float, float]
 
@@ -38,8 +38,8 @@ class SeenWater:
     shown_compression: float
     """Of the highlights that it shows."""
     lamp: RGB
-    """Light from beside the eye (:class:`aquaflow.water.model.Lamp`): share, power, range; a share
-    of 0 where there is none."""
+    """Light from beside the eye (:class:`aquaflow.water.mounting.Lamp`): share, power, range; a
+    share of 0 where there is none."""
 
     def to_json(self) -> dict[str, Any]:
         """The water by the names that the page uses."""

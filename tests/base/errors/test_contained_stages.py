@@ -33,6 +33,7 @@ from aquaflow.tracking.initialisation.initialiser import Initialiser
 from aquaflow.tracking.loops import Places
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Dropped, Frame
+from aquaflow.water import estimation
 
 pytestmark = pytest.mark.usefixtures("contained")
 
@@ -125,6 +126,31 @@ def test_every_stage_may_fail_once_in_one_dive(
     assert all(f"{stage} failed once" in report for *_, stage in STAGES)
     log = [json.loads(line) for line in (finished.dive / "log.jsonl").read_text().splitlines()]
     assert sum("planted in" in line.get("exception", "") for line in log) == len(STAGES)
+
+
+def test_a_programming_error_in_a_stage_is_a_warning_with_its_traceback_and_fails_a_test(
+    small_recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    contained_defects: list[str],
+) -> None:
+    scope: dict[str, Any] = {}
+    statement = "def fit_likeliest(problems):\n    yield unknown\n"
+    exec(compile(statement, estimation.__file__, "exec"), scope)
+    monkeypatch.setattr(estimation, "fit_likeliest", scope["fit_likeliest"])
+    finished = mapped(open_recording(small_recording), tmp_path / "dive", stopped(SETTINGS, MAPPED))
+    (failure,) = finished.metrics["failures"]
+    assert (failure["stage"], failure["error"], failure["defect"]) == (
+        "water fit", "NameError", True,
+    )  # fmt: skip
+    (warning,) = [each for each in finished.metrics["warnings"] if "defect" in each]
+    assert warning.startswith("water fit failed")
+    assert "aquaflow/water/estimation.py: fit_likeliest); a defect in AquaFlow" in warning
+    assert not any("water fit" in note for note in finished.notes)
+    assert warning.split(" (")[0] in (finished.dive / "report.html").read_text()
+    assert "name 'unknown' is not defined" in (finished.dive / "log.jsonl").read_text()
+    assert contained_defects, "the guard of every test (conftest.py) has not seen it"
+    contained_defects.clear()
 
 
 def test_frames_that_a_failing_tracker_held_are_accounted_for(

@@ -57,13 +57,18 @@ def test_an_exception_is_counted_by_stage_kind_and_place() -> None:
 @pytest.mark.parametrize(
     "statement", ["assert False", "None.x", "[][0]", "{}['k']", "missing", "len(3)"]
 )
-def test_a_programming_error_of_ours_is_reported_as_such(statement: str) -> None:
+def test_a_programming_error_of_ours_is_reported_as_such(
+    statement: str, contained_defects: list[str]
+) -> None:
     failures = Failures(strict=False)
     with failures.contain("pose"):
         raise_in(OWN, statement)
     [kind] = failures.kinds
     assert kind.defect
     assert "a defect in AquaFlow, please report it" in kind.note()
+    assert failures.defects() == [kind.note()]
+    assert failures.notes() == []
+    contained_defects.clear()
 
 
 def test_the_same_error_out_of_a_library_is_not_called_ours() -> None:

@@ -7,7 +7,7 @@ import json
 import shutil
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from aquaflow.dive.point_cloud import read_point_cloud, read_posed_views
 from aquaflow.dive.restored import restored_frames, tone_without_water
 from aquaflow.dive.ros.topics import LASTING, TYPES
 from aquaflow.survey.export.mcap_export import export_mcap
+from aquaflow.water.mounting import Lamp
 from tests.command_line import Cli, refused
 from tests.dive.ros.published import HASHES, hash_of
 
@@ -62,9 +63,14 @@ def dive(small_dive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     metrics = json.loads((folder / "metrics.json").read_text())
     metrics |= {"utc_start": START_UTC, "warnings": ["something is poor"]}
     (folder / "metrics.json").write_text(json.dumps(metrics))
+    medium = json.loads((folder / "medium.json").read_text())
+    (folder / "medium.json").write_text(json.dumps(medium | {"lamp": asdict(LAMP)}))
     with (folder / "frames.csv").open("a") as table:
         table.write("24,000024.png,2.400000000,lost,,,,too few matches\n")
     return folder
+
+
+LAMP = Lamp(0.8, 2.0, 1.5, 0.05, ((-0.2, -0.1), (0.2, -0.1)), (0.03, 0.02))
 
 
 @pytest.fixture(scope="module")
@@ -245,6 +251,10 @@ def test_diagnostics_state_water_warnings_and_lost_frames(messages: Messages, di
     values = {pair.key: pair.value for pair in water.values}
     red = values[f"attenuation red, {stated['attenuation_unit']}"]
     assert float(red) == pytest.approx(stated["attenuation_per_unit"][0], rel=1e-5)
+    (share,) = (value for key, value in values.items() if "share of the light at 1.5 " in key)
+    assert float(share) == LAMP.share
+    (place,) = (value for key, value in values.items() if key.startswith("lamp 2 right of"))
+    assert place == "0.2, -0.1"
     last = messages["/diagnostics"][-1].ros_msg.status[0]
     assert (int(last.level), last.message) == (1, "lost: too few matches")
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from pydantic import ValidationError
 from rosbags.typesys import Stores, get_typestore
@@ -32,14 +33,17 @@ from aquaflow.dive.ros.topics import encode
 from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.foxglove.live import LiveFoxglove
-from aquaflow.live.foxglove.map_moment import cloud_of, take_map_moment
+from aquaflow.live.foxglove.map_moment import cloud_of, take_map_moment, water_status
 from aquaflow.live.foxglove.server import BACKLOG, FoxgloveServer
 from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
 from aquaflow.live.service_frontends import ServiceFrontends
 from aquaflow.sources import open_recording
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import Frame
+from aquaflow.water.medium import WaterParameters
+from aquaflow.water.mounting import Lamp
 from tests.dive.ros.published import HASHES, hash_of
 from tests.live.live_scenes import VEHICLE, ToldFeed
 from tests.small_recording import GIVE_UP_S
@@ -360,3 +364,15 @@ def test_the_example_node_hands_messages_on_byte_for_byte(
         topics.CAMERA: ("class of sensor_msgs/msg/CompressedImage", "volatile"),
     }
     assert set(example.LASTING) == set(topics.LASTING)
+
+
+def test_the_waters_status_names_the_vehicles_lamps() -> None:
+    three = torch.full((3,), 0.2)
+    lamp = Lamp(0.8, 2.0, 1.5, 0.05, ((-0.2, -0.1), (0.2, -0.1)), (0.03, 0.02))
+    for lit in (None, lamp):
+        status = water_status(WaterParameters(*[three] * 5, lamp=lit), WorldFrame.unknown())
+        values = {pair.key: pair.value for pair in status.values}
+        named = [key for key in values if "lamp" in key]
+        assert bool(named) is (lit is not None)
+    assert values["lamps, share of the light at 1.5 map unit"] == "0.8"
+    assert values["lamp 1 right of and below the camera, map unit"] == "-0.2, -0.1"

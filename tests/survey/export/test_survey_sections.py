@@ -30,6 +30,7 @@ from aquaflow.survey.report.page import render_report
 from aquaflow.survey.report.pdf import write_pdf
 from aquaflow.survey.report.report_of import MOST_REASONS, left_out, profile
 from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.water.mounting import Lamp
 from tests.survey.coverage.surveys import lawnmower, metric, survey_of
 
 VIEW = survey_of(lawnmower(3, 6.0, 1.0, 0.45))
@@ -66,6 +67,19 @@ def survey(**changes: object) -> ReportData:
         notes=["a note " * 40],
     )
     return replace(data, **changes)  # type: ignore[arg-type]
+
+
+def test_lamps_are_named_where_there_are_any_with_their_places_where_those_are_known() -> None:
+    assert "Lamps light the scene" not in render_report(survey())
+    lamp = Lamp(0.82, 2.0, 1.5)
+    page = render_report(survey(medium=replace(WATER, lamp=lamp)))
+    assert "82% of the light is theirs at 1.5 m" in page
+    assert "below the camera" not in page
+    places = ((-0.2, -0.1), (0.2, -0.1))
+    known = replace(lamp, share_sigma=0.04, places=places, places_sigma=(0.03, 0.02))
+    page = render_report(survey(medium=replace(WATER, lamp=known)))
+    assert "82% \u00b1 4% of the light" in page
+    assert "(-0.20, -0.10) and (0.20, -0.10) m right of and below" in page
 
 
 def test_the_page_says_what_was_seen_and_how_deep_and_in_which_water() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.metric_file import read_metric_file, write_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.water.mounting import Lamp
 from tests.command_line import Cli, refused
 from tests.metric_scenes import metric_frame
 
@@ -29,11 +31,16 @@ LENGTH = ("--from", "0,0,1", "--to", "0,0.5,1", "--length", 1.5)
 """1.5 m are half a map unit."""
 
 
+LAMP = Lamp(0.8, 2.0, 1.5, 0.05, ((-0.2, -0.1), (0.2, -0.1)), (0.03, 0.02))
+
+
 @pytest.fixture
 def dive(small_dive: Path, tmp_path: Path) -> Path:
     """Of which nothing has measured the scale."""
     folder = Path(shutil.copytree(small_dive, tmp_path / "dive"))
     write_metric_file(folder, {0: WorldFrame.unknown()}, main=0)
+    medium = json.loads((folder / "medium.json").read_text())
+    (folder / "medium.json").write_text(json.dumps(medium | {"lamp": asdict(LAMP)}))
     return folder
 
 
@@ -51,6 +58,7 @@ def numbers(dive: Path) -> dict[str, Any]:
         "scales": clear.scales,
         "held out": np.concatenate([np.load(path)["z"].ravel() for path in ranges]),
         "ranges": np.array([water["range_p5"], water["map_ply_reference_range"]]),
+        "lamp": np.array([water["lamp"]["range"], *np.ravel(water["lamp"]["places"])]),
         "coverage": np.array([coverage["scale"], coverage["swath"]]),
         "path per rate": 1.0 / np.array(water["attenuation_per_unit"]),
         "path per b": 1.0 / np.array(water["backscatter"]["b"]),

@@ -12,7 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.state import MapCopy
 from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.live_viewer import pack_for_browser
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.tone import ShownTone
 
 

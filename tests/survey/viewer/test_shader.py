@@ -14,7 +14,7 @@ import torch
 from aquaflow.survey.viewer import client
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.water.medium import WaterParameters
-from aquaflow.water.model import Lamp
+from aquaflow.water.mounting import Lamp
 from aquaflow.water.tone import ShownTone
 
 Array = npt.NDArray[np.float64]

@@ -33,7 +33,7 @@ vec3 toned(vec3 bright, float c) {
   return min(bright, 0.8) + above / max(1.0 + c * above, 0.02);
 }
 
-// lamp: share of the light, power and range (aquaflow/water/model.py); its light comes as the water does.
+// lamp: share of the light, power and range (aquaflow/water/mounting.py); its light comes as the water does.
 vec3 throughWater(vec3 clear, float range) {
   float far = min(range, through), z = far * water;
   vec3 T = exp(-beta * z);
