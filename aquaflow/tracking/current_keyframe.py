@@ -216,11 +216,12 @@ class KeyframeTracker:
     def pointmap(
         self, at: CurrentKeyframe, solved: Matched, camera: CameraModel
     ) -> tuple[Pointmap, LearnedDepth | None]:
-        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them."""
+        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them. Of
+        a frame that is hidden, or whose matches contradict its pose, only those of matches that are
+        where that puts them: on tiles a third of the others are those of the next one."""
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
-        reliable = (
-            self.shown_pixels(at, solved, camera) if self.is_hidden(solved) else pair.valid_back
-        )
+        doubtful = self.is_hidden(solved) or self._wide_steps.is_contradicted(solved)
+        reliable = self.shown_pixels(at, solved, camera) if doubtful else pair.valid_back
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
         config, known, unit = self._config, self._config.known_sigma, pair.range_unit
 

@@ -14,6 +14,7 @@ from aquaflow.tracking.frames import FrameClass
 from aquaflow.tracking.pose.matcher import KeyframeMatcher
 from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.tracking.wide_steps import WideSteps
 from tests.tracking.tracked_clips import (
     PLACED,
     QUICK,
@@ -86,6 +87,35 @@ def test_a_keyframe_that_goes_out_of_view_is_replaced_even_by_a_frame_with_snow(
         assert known.any()
         assert np.median(np.abs(1.0 / keyframe.pointmap.rho[known] / truth - 1.0)) < 0.02
     assert error_share(result.tracked, poses) < 0.01
+
+
+def test_a_contradicted_frame_takes_no_depth_over_matches_that_its_pose_does_not_explain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On tiles a third of the matches may lie tiles off, and nothing is hidden."""
+    poses = path(30, step=0.06)
+    prior = told(poses)
+    plain = prior.decode
+
+    def tiles_off(
+        a: KnownView, b: KnownView, predicted: np.ndarray | None = None, alone: bool = False
+    ) -> KnownPair:
+        pair = plain(a, b, predicted, alone)
+        rng = np.random.default_rng(len(prior.predictions))
+        pair.matches_back[rng.random(pair.valid_back.shape) < 0.3] += (0.0, 24.0)
+        return pair
+
+    prior.decode = tiles_off  # type: ignore[method-assign]
+    monkeypatch.setattr(WideSteps, "is_contradicted", lambda *_: True)
+    result = run(prior.frames(SMALL), QUICK, prior)
+    later = result.store.keyframes[1:]
+    assert later
+    scale = 1.0 / result.store[0].pointmap.rho[36, 48] / plane_depth(poses[0])[36, 48]
+    for keyframe in later:
+        known = keyframe.pointmap.is_known(0.15)
+        truth = scale * plane_depth(poses[keyframe.frame_index])[known]
+        assert known.mean() > 0.3
+        assert np.mean(np.abs(1.0 / keyframe.pointmap.rho[known] / truth - 1.0) > 0.05) < 0.01
 
 
 # --- keyframes taken up again ---------------------------------------------------------------------
