@@ -87,6 +87,8 @@ class MapOnGpu:
         self._pixels: dict[str, Any] = {}
         self._small: dict[str, Any] = {}
         self._planned: tuple[int, int, tuple[int, int], int] | None = None
+        """Gaussians, room for them, picture and room for hits that the kernels are bound for."""
+        self._size = (0, 0)
         self._count = 0
 
     # --- the map, up and down -----------------------------------------------------------------
@@ -103,7 +105,7 @@ class MapOnGpu:
                 room = int(1.25 * self._count)
                 names = ("raw", "first", "second")
                 self._rows = {name: self.device.buffer(ROW * room) for name in names}
-                self._rows["room"], self._planned = room, None
+                self._rows["room"] = room
             tables = {
                 "raw": parameters,
                 "first": adam.first_moments,
@@ -116,9 +118,13 @@ class MapOnGpu:
                 if name == "first":
                     rows[:, COUNT_AT] = adam.steps.numpy()
                 self.device.write(self._rows[name], rows)
-            self._bias = self.device.buffer(adam.bias.numel())
-            self.device.write(self._bias, adam.bias.numpy())
-            self._bias_rows, self._planned = len(adam.bias), None
+            if "bias" not in self._small:
+                self._small["bias"] = self.device.buffer(adam.bias.numel())
+                self.device.write(self._small["bias"], adam.bias.numpy())
+                self._small["results"] = self.device.buffer(4 * RESULTS)
+                self._small["rates"] = self.device.buffer(12, uniform=True)
+                self._small["step"] = self.device.buffer(36, uniform=True)
+        self._bias_rows = len(adam.bias)
         self._settings = (1.0 - adam.betas[0], 1.0 - adam.betas[1], adam.eps)
         self.is_loaded = True
 
@@ -228,16 +234,13 @@ class MapOnGpu:
         if wanted == self._planned:
             return
         new = self.device.buffer
-        if not self._small:
-            self._small = {"results": new(4 * RESULTS), "rates": new(12, uniform=True)}
-            self._small["step"] = new(36, uniform=True)
-        if self._planned is None or self._planned[2] != view.size:
+        if view.size != self._size:
             rows, columns = tile_grid(width, height)
             sizes = {"image": 4, "mask": 1, "slopes": 12, "g_image": 4, "gains": 4, "observed": 3}
             self._pixels = {name: new(each * width * height) for name, each in sizes.items()}
             self._pixels["losses"] = new(4 * rows * columns)
             self._pixels["waters"] = new(20 * rows * columns)
-            self._even = False
+            self._size, self._even = view.size, False
         self._small["volumes"] = new(4 * -(-self._count // WORKGROUP))
         self._drawn, self._compared = self._plan()
         self._planned = wanted
@@ -311,7 +314,7 @@ class MapOnGpu:
             *self.drawing.gradient_steps,
             sum_up(at["view"], blocks, 3, VIEW),
             do("adam", "adam", blocks, step, small["rates"], rows["raw"], rows["first"],
-               rows["second"], "gradients", "radius", self._bias, results, "total"),
+               rows["second"], "gradients", "radius", small["bias"], results, "total"),
         ]  # fmt: skip
         return drawn, moved
 
