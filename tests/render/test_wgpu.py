@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -158,9 +160,25 @@ def test_a_program_that_stands_in_for_a_gpu_counts_only_where_it_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, found: list[Adapter], software: bool, said: str | None
 ) -> None:
     monkeypatch.setattr(webgpu, "missing_package", lambda: None)
+    monkeypatch.setattr(webgpu, "_has_gpu", lambda: True)
     monkeypatch.setattr(webgpu, "find_adapters", lambda: [(each, None) for each in found])
     reason = missing(software)
     assert reason is None if said is None else said in str(reason)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev is Linux's")
+@pytest.mark.parametrize("node", ["dri/renderD128", "nvidiactl", "nvhost-gpu", "nvmap", "dxg"])
+def test_drivers_are_only_loaded_where_there_is_a_gpu(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, node: str
+) -> None:
+    (tmp_path / node).parent.mkdir(exist_ok=True)
+    assert not webgpu._has_gpu(tmp_path)
+    (tmp_path / node).touch()
+    assert webgpu._has_gpu(tmp_path)
+    monkeypatch.setattr(webgpu, "missing_package", lambda: None)
+    monkeypatch.setattr(webgpu, "_has_gpu", lambda: False)
+    monkeypatch.setattr(webgpu, "find_adapters", lambda: pytest.fail("drivers were loaded"))
+    assert missing(software=False) == "There is no GPU: /dev has no device of one."
 
 
 class Slow:
