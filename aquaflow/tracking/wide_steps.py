@@ -131,14 +131,11 @@ class WideSteps:
         predicted: Sim3,
     ) -> Matched | None:
         """The pose of a frame that shows what of the keyframe has no depth yet, which it gets from
-        this pair of views; the keyframe must be the one held. Matches of what has a depth, which
-        have given no pose, are those of something else."""
+        this pair of views; the keyframe must be the one held."""
         pointmap, config = keyframe.pointmap, self._config
         known = pointmap.is_known(config.known_sigma)
         for pair in self._surest_first(pointmap, reference, encoding, camera, predicted):
             if matched_share(keyframe.encoding, pair) < RECOVERED_SUPPORT:
-                continue
-            if (pair.valid & known).sum() >= config.least_known_share * pair.valid.sum():
                 continue
             T_fk = turning_step(pointmap, pair, known, camera, predicted)
             if T_fk is not None:

@@ -222,21 +222,6 @@ def test_a_pose_from_the_rim_of_what_is_known_is_replaced_after_a_turn() -> None
     assert turned < 0.1 < 0.5 * rough_turned
 
 
-def test_depths_that_matches_contradict_are_not_replaced_as_after_a_turn() -> None:
-    """A step that flow follows tiles off, seen by depths that say nothing of the kind."""
-    store, T_wc = KeyframeStore(), pose((0.0, 0.0, 0.0), (0.25, 0.05, 0.0))
-    keyframe = keyframe_at(HERE, store)
-    rng = np.random.default_rng(0)
-    keyframe.pointmap.rho *= np.exp(rng.normal(size=keyframe.pointmap.rho.shape))
-    before = keyframe.pointmap.copy()
-    at = CurrentKeyframe(keyframe)
-    at.motion = T_wc.inverse()
-    tracker = KeyframeTracker(PRIOR, store, TrackingConfig())
-    frame = PRIOR.encode(FLOOR.picture(T_wc), CAMERA)
-    assert tracker.place_after_turn(at, frame, CAMERA, None) is None
-    np.testing.assert_array_equal(keyframe.pointmap.rho, before.rho)
-
-
 def test_a_pose_from_a_known_view_stays_as_it_is() -> None:
     store = KeyframeStore()
     T_wc = pose((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
