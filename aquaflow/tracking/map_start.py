@@ -140,6 +140,9 @@ class MapStart:
             for waiting, T in zip(solution.waiting, solution.T, strict=True)
         ]
         start = NewMap(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
+        counted = {waiting.frame.index for waiting in solution.waiting}
+        unsure = [each.frame for each in initialiser.waiting if each.frame.index not in counted]
+        self._waiting.put(unsure, Wait.THINNED)
         if not self._in_step:
             return replace(start, posed=posed[-1:], T_waiting=solution.T[-1])
         thinned = [PosedFrame(frame) for frame in self._waiting.of(Wait.THINNED)]

@@ -32,7 +32,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Initialised:
-    """The best hypothesis: poses ``T_fk`` of the waiting frames, scale set by median depth 1."""
+    """The best hypothesis: poses ``T_fk`` of the frames that count, scale set by median depth 1."""
 
     waiting: list[MatchedFrame]
     T: list[Sim3]
@@ -88,8 +88,8 @@ class Initialiser:
         self._sure: list[int] = []
         """Sure matches of the frames so far, in their order."""
         self.contradicted = False
-        """True if no geometry explained the matches of the last attempt, which had little parallax:
-        they have gone wrong."""
+        """True if no geometry explained the matches of the last attempt, which had little parallax,
+        or those of the newest frame are not sure any more: they have gone wrong."""
         self._samples = grid_samples(reference.interesting, config.points)
 
     def add(self, frame: Frame, encoding: Encoding) -> bool:
@@ -170,34 +170,42 @@ class Initialiser:
         return max(self._enough_px, RETRY_GROWTH * self._tried_px)
 
     def solve(self) -> Initialised | None:
-        """The best explanation of all waiting frames; None when none is good enough."""
+        """The best explanation of the waiting frames; where there is none that is good enough, of
+        those whose matches are sure; None where there is none of them either."""
+        sure = [frame for frame in self.waiting if frame.is_sure]
+        found = self._explain(self.waiting)
+        if found is None and 0 < len(sure) < len(self.waiting):
+            found = self._explain(sure)
+            self.contradicted |= self.parallax_px < self._enough_px and not self.waiting[-1].is_sure
+        self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
+        return found
+
+    def _explain(self, frames: list[MatchedFrame]) -> Initialised | None:
+        """The best explanation of these frames; None where it is not good enough."""
         camera, pixels = self.reference.camera, self._pixels_reference
-        hypotheses = Hypotheses(camera, pixels, self.waiting, self._config)
+        hypotheses = Hypotheses(camera, pixels, frames, self._config)
         result = hypotheses.best()
         explained = 0.0 if result is None else hypotheses.explained_share(result.bundle)
-        trusted = result is not None and self._trustworthy(hypotheses, explained, result)
-        little = self.parallax_px < self._enough_px
-        if little:
-            trusted = trusted and result is not None and self._is_decided(hypotheses, result)
+        parallax_px = max((frame.parallax_px for frame in frames), default=0.0)
+        little = parallax_px < self._enough_px
         self.contradicted = little and explained < self._config.min_explained
-        self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
-        if result is None or not trusted:
+        if result is None or not self._trustworthy(hypotheses, explained, result, parallax_px):
+            return None
+        if little and not self._is_decided(hypotheses, result):
             return None
         return Initialised(
-            self.waiting,
-            result.bundle.T,
-            result.bundle.camera,
-            result.residual_px,
-            result.focal_sigma,
+            frames, result.bundle.T, result.bundle.camera, result.residual_px, result.focal_sigma
         )
 
-    def _trustworthy(self, hypotheses: Hypotheses, explained: float, result: BundleResult) -> bool:
+    def _trustworthy(
+        self, hypotheses: Hypotheses, explained: float, result: BundleResult, parallax_px: float
+    ) -> bool:
         focal_known = (
             result.focal_sigma <= self._config.max_focal_sigma
-            or self.parallax_px > 3.0 * self._config.parallax_widths * result.bundle.camera.width
+            or parallax_px > 3.0 * self._config.parallax_widths * result.bundle.camera.width
         )
         return (
-            self.parallax_px > self._config.sigma_px  # less is noise, which has depths of its own
+            parallax_px > self._config.sigma_px  # less is noise, which has depths of its own
             and explained >= self._config.min_explained
             and hypotheses.depth_sigma(result) <= self._config.max_depth_sigma
             and focal_known
@@ -205,10 +213,12 @@ class Initialiser:
 
     def _is_decided(self, hypotheses: Hypotheses, result: BundleResult) -> bool:
         """True if depths and direction are known, however little parallax there is: at the noise
-        that matches are known to have, not that of the few that are left, and without a rival."""
+        that matches are known to have, not that of the few that are left, without a rival, and for
+        every frame: one whose matches are a period off bends the geometry of the others."""
         worse = max(self._config.sigma_px / result.residual_px, 1.0)
         known = worse * hypotheses.depth_sigma(result) <= self._config.max_depth_sigma
-        return known and not hypotheses.ambiguous
+        least = hypotheses.least_explained(result.bundle)
+        return known and not hypotheses.ambiguous and least >= self._config.min_explained
 
     @property
     def _pixels_reference(self) -> Array:
@@ -306,10 +316,19 @@ class MatchedFrame:
         return self.weights > 0.0
 
     @property
+    def is_sure(self) -> bool:
+        """True if enough of the matches are sure: where the ground repeats itself, those of a frame
+        that is too far away are of a whole period off, all of them."""
+        return int(self._sure.sum()) >= MIN_MATCHES
+
+    @property
     def sure(self) -> npt.NDArray[np.bool_]:
         """[P] samples whose match is sure; all that are seen where these are too few."""
-        sure = self.weights > SURE / (SURE + HALF_CONFIDENCE)
-        return sure if sure.sum() >= MIN_MATCHES else self.observed
+        return self._sure if self.is_sure else self.observed
+
+    @property
+    def _sure(self) -> npt.NDArray[np.bool_]:
+        return self.weights > SURE / (SURE + HALF_CONFIDENCE)
 
 
 class Hypotheses:
@@ -367,6 +386,11 @@ class Hypotheses:
     def explained_share(self, bundle: Bundle) -> float:
         """Share of all information in front of its camera and within a pixel of its match."""
         return self._explained_share(bundle, self._waiting)
+
+    def least_explained(self, bundle: Bundle) -> float:
+        """The same share of the frame that has least of it."""
+        views = zip(self._waiting, bundle.T, strict=True)
+        return min(self._explained_share(replace(bundle, T=[T]), [frame]) for frame, T in views)
 
     def depth_sigma(self, result: BundleResult) -> float:
         """Median relative sigma of the depths that :meth:`best` found."""

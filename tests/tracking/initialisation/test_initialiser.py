@@ -13,7 +13,12 @@ from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.tracking.initialisation import initialiser as initialiser_module
-from aquaflow.tracking.initialisation.initialiser import Hypotheses, Initialiser, calibrate
+from aquaflow.tracking.initialisation.initialiser import (
+    Hypotheses,
+    Initialiser,
+    MatchedFrame,
+    calibrate,
+)
 from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, depth_map, pose
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
@@ -325,6 +330,47 @@ class UnsurePrior(KnownPrior):
 
 def test_a_start_without_a_confident_match_takes_what_there_is() -> None:
     assert_poses(started(UnsurePrior(prior_of(MOVING).views, CAMERA)), MOVING, 0.01)
+
+
+def mistake(frame: MatchedFrame) -> None:
+    """Put every match of ``frame`` a tile to one side or the other."""
+    frame.pixels[::2] += (9.0, 0.0)
+    frame.pixels[1::2] -= (9.0, 0.0)
+
+
+def test_a_frame_that_is_sure_of_nothing_takes_no_part_where_it_fits_no_geometry() -> None:
+    config = InitialisationConfig(points=300, pairs=1, parallax_widths=0.3)
+    for confidence in (1.0, 0.1):
+        initialiser = started(prior_of(MOVING, noise_px=0.02), config)
+        mistake(initialiser.waiting[2])
+        initialiser.waiting[2].weights[:] *= confidence
+        solution = initialiser.solve()
+        if confidence == 1.0:
+            assert solution is None
+        else:
+            assert solution is not None
+            assert [frame.frame.index for frame in solution.waiting] == [1, 2, 4, 5, 6]
+
+
+def test_a_reference_is_left_when_the_newest_frame_is_sure_of_nothing() -> None:
+    """And the others have too little parallax."""
+    near = [pose((0.0, 0.0, 0.0), (0.002 * i, 0.0, 0.001 * i)) for i in range(4)]
+    for confidence in (1.0, 0.1):
+        initialiser = started(prior_of(near))
+        initialiser.waiting[-1].weights[:] *= confidence
+        assert initialiser.solve() is None
+        assert initialiser.contradicted == (confidence < 1.0)
+
+
+def test_a_geometry_of_little_parallax_must_explain_every_frame() -> None:
+    config = InitialisationConfig(points=300, pairs=1, parallax_widths=0.3)
+    found = []
+    for wrong in (0, 1):
+        initialiser = started(prior_of(MOVING, noise_px=0.02), config)
+        for frame in initialiser.waiting[:wrong]:
+            mistake(frame)
+        found.append(initialiser.solve() is not None)
+    assert found == [True, False]
 
 
 @pytest.mark.filterwarnings("error")
