@@ -33,12 +33,11 @@ from aquaflow.mapping.optimisation import (
     MapOptimiser,
     Objective,
     refining_rates,
-    register,
     sampled_views,
     share_done,
     shuffled_views,
-    take_light,
 )
+from aquaflow.mapping.registration import register, take_light
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.mapping.scene_water import WaterFitting, rebalance
 from aquaflow.render.contract import Renderer
