@@ -29,8 +29,7 @@ from aquaflow.render.photometric import (
     photometric_loss,
     radial_weight,
 )
-from aquaflow.render.views import View
-from aquaflow.render.views import refine_pose as refine_pose_of
+from aquaflow.render.views import View, refine_pose
 from aquaflow.render.webgpu import WgpuRenderer
 
 log = logging.getLogger(__name__)
@@ -96,24 +95,21 @@ class MapOptimiser:
             view.looks += 1
             return
         self.medium_adam.forget_gradients()
-        if (
-            self._gpu is None
-            or not self._gpu.works
-            or not self._step_on_gpu(view, active, refine_pose)
-        ):
+        gpu = self._gpu
+        if gpu is None or not gpu.works or not self._step_on_gpu(gpu, view, active, refine_pose):
             self._step_here(view, active, refine_pose)
 
     def _step_here(
         self,
         view: View,
         active: Tensor | None,  # [rows, columns] bool, the tiles to draw
-        refine_pose: bool,
+        with_pose: bool,
     ) -> None:
         leaves = {
             name: tensor.detach().requires_grad_(self._is_optimised(name))
             for name, tensor in self.scene.gaussians.parameters.items()
         }
-        viewmat = view.viewmat().requires_grad_(refine_pose)
+        viewmat = view.viewmat().requires_grad_(with_pose)
         neural = self.scene.neural
         seen = leaves if neural is None else neural.decode(view, leaves, viewmat)
         # Water and a view's light hardly change from step to step: full looks follow them.
@@ -123,26 +119,22 @@ class MapOptimiser:
         record_look(view, errors, self.config.optimiser)
         loss = self._objective.total(view, shown, seen)
         if not is_number(loss):
-            self._undo("loss", view)
-            self.drop_unsound()
+            self._undo_loss(view)
             return
         torch.autograd.backward(loss)
         gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
         self.adam.step(shown.visible, gradients)
-        self._step_medium(view)
-        if viewmat.grad is not None:
-            refine_pose_of(view, viewmat.grad, self.config.optimiser.poses)
-        self._count_step(view, lambda: shown.radius_px)
+        self._finish_step(view, viewmat.grad, lambda: shown.radius_px)
 
     def _step_on_gpu(
         self,
+        gpu: GpuSteps,
         view: View,
         active: Tensor | None,  # [rows, columns] bool, the tiles to draw
-        refine_pose: bool,
+        with_pose: bool,
     ) -> bool:
         """The same as :meth:`_step_here`; False where the GPU failed and nothing was done."""
-        gpu, learn = self._gpu, is_full_look(view, self.config.optimiser)
-        assert gpu is not None
+        learn = is_full_look(view, self.config.optimiser)
         water_learns = learn or self.scene.medium.directional  # as in Scene.draw
         with torch.set_grad_enabled(water_learns):
             water = self.scene.water(view)
@@ -152,19 +144,27 @@ class MapOptimiser:
             return False
         record_look(view, outcome.errors, self.config.optimiser)
         if not math.isfinite(outcome.loss):
-            self._undo("loss", view)
-            self.drop_unsound()
+            self._undo_loss(view)
             return True
         if stack is not None and stack.requires_grad:
             torch.autograd.backward(stack, outcome.g_water)
-        self._step_medium(view)
-        if refine_pose:
-            refine_pose_of(view, outcome.g_viewmat, self.config.optimiser.poses)
-        self._count_step(view, gpu.radius_px)
+        self._finish_step(view, outcome.g_viewmat if with_pose else None, gpu.radius_px)
         return True
 
-    def _count_step(self, view: View, radius_px: Callable[[], Tensor]) -> None:
-        """Count a step, and prune now and then; ``radius_px`` [N] is asked for only then."""
+    def _undo_loss(self, view: View) -> None:
+        self._undo("loss", view)
+        self.drop_unsound()
+
+    def _finish_step(
+        self,
+        view: View,
+        g_viewmat: Tensor | None,  # [4, 4]
+        radius_px: Callable[[], Tensor],  # [N], asked for only where it is needed
+    ) -> None:
+        """Move the water and the pose; prune now and then."""
+        self._step_medium(view)
+        if g_viewmat is not None:
+            refine_pose(view, g_viewmat, self.config.optimiser.poses)
         self.steps += 1
         if self.steps % self.config.optimiser.prune_every == 0:
             self._prune(radius_px(), view)
