@@ -30,7 +30,7 @@ from aquaflow.render.contract import (
 )
 from aquaflow.render.cpu import cpu_renderer
 from aquaflow.render.webgpu_device import missing, shared_device
-from aquaflow.render.webgpu_drawing import ROW, Drawing
+from aquaflow.render.webgpu_drawing import COLOURS, MEAN, OPACITY, QUAT, ROW, SCALES, Drawing
 
 log = logging.getLogger(__name__)
 
@@ -234,7 +234,8 @@ class _Rasterise(torch.autograd.Function):
             ctx.renderer.leave_gpu(error)
             found = ctx.renderer.gradients_on_processor(inputs, ctx.camera, g_image, g_alpha)
             return (*found, None, None)
-        parts = (rows[:, :3], rows[:, 4:8], rows[:, 8:11], rows[:, 3], rows[:, 12 : 12 + channels])
+        colours = rows[:, COLOURS][:, :channels]
+        parts = (rows[:, MEAN], rows[:, QUAT], rows[:, SCALES], rows[:, OPACITY][:, 0], colours)
         return (*(part.contiguous() for part in parts), viewmat, None, None)
 
 
@@ -247,7 +248,7 @@ def _pack(
 ) -> npt.NDArray[np.float32]:
     """[N, ROW], as the kernels have them."""
     rows = torch.zeros(len(means), ROW)
-    rows[:, :3], rows[:, 3], rows[:, 4:8], rows[:, 8:11] = means, opacities, quats, scales
-    rows[:, 12 : 12 + colours.shape[1]] = colours
+    rows[:, MEAN], rows[:, QUAT], rows[:, SCALES] = means, quats, scales
+    rows[:, OPACITY], rows[:, COLOURS][:, : colours.shape[1]] = opacities[:, None], colours
     packed: npt.NDArray[np.float32] = rows.numpy()
     return packed

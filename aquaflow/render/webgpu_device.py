@@ -80,16 +80,17 @@ def _wgpu() -> Any:
     return wgpu
 
 
-def find_adapters() -> list[tuple[Adapter, Any]]:
+@lru_cache(maxsize=1)
+def find_adapters() -> tuple[tuple[Adapter, Any], ...]:
     """The adapters that kernels can run on, real GPUs first, those with memory of their own before
-    the others; each with wgpu's object of it."""
+    the others; each with wgpu's object of it. Looked for once in a process."""
     found = []
     for adapter in _wgpu().gpu.enumerate_adapters_sync():
         info = adapter.info
         names = ("device", "backend_type", "adapter_type", "description")
         found.append((Adapter(*(info[name] for name in names)), adapter))
     order = {"DiscreteGPU": 0, "IntegratedGPU": 1, "CPU": 3}
-    return sorted(found, key=lambda each: order.get(each[0].kind, 2))
+    return tuple(sorted(found, key=lambda each: order.get(each[0].kind, 2)))
 
 
 def missing(software: bool = True) -> str | None:

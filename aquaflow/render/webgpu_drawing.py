@@ -13,7 +13,10 @@ from aquaflow.render.contract import tile_grid
 from aquaflow.render.webgpu_device import MOMENTS, Device, Step
 
 ROW = 16
-"""Numbers of a Gaussian, and of its gradient: mean, opacity, quaternion, scales, a gap, colours."""
+"""Numbers of a Gaussian, of its gradient and of its raw parameters."""
+MEAN, OPACITY, QUAT = slice(0, 3), slice(3, 4), slice(4, 8)
+SCALES, COLOURS = slice(8, 11), slice(12, 16)
+"""Where they are in a row; there is a gap behind the scales."""
 WORKGROUP = 256
 """Threads of the kernels that take a Gaussian or a hit each."""
 SORTED = 2048
@@ -158,6 +161,17 @@ class Drawing:
         )
         return Step(pipeline, bindings, groups if isinstance(groups, tuple) else (groups,))
 
+    def look(
+        self,
+        camera: npt.NDArray[np.uint32],  # [28] bits of the struct Camera
+        tiles_drawn: npt.NDArray[np.uint32],  # [rows, columns]
+    ) -> None:
+        """Let the next drawing of the prepared picture be from this camera."""
+        at, write = self.named(), self.device.write
+        write(at["camera"], camera)
+        write(at["tiles_drawn"], tiles_drawn)
+        write(at["listed"], np.array([self.count], np.uint32))
+
     # --- drawing and differentiating ----------------------------------------------------------
 
     def draw(
@@ -174,9 +188,7 @@ class Drawing:
                 self.prepare(len(gaussians), width, height)
                 at, pixels = self.named(), width * height
                 self.device.write(at["gaussians"], gaussians)
-                self.device.write(at["camera"], camera)
-                self.device.write(at["tiles_drawn"], tiles_drawn)
-                self.device.write(at["listed"], np.array([self.count], np.uint32))
+                self.look(camera, tiles_drawn)
                 self.device.submit(self.drawing_steps, clear=[at["ranges"]])
                 wanted = {"colours": 4 * pixels, "rest": pixels, "radius": self.count, "total": 1}
                 colours, rest, radius, total = self.device.read(

@@ -19,17 +19,27 @@ from torch import Tensor
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import tile_grid
 from aquaflow.render.webgpu_device import Device, Step
-from aquaflow.render.webgpu_drawing import ROW, WORKGROUP, Drawing
+from aquaflow.render.webgpu_drawing import (
+    COLOURS,
+    MEAN,
+    OPACITY,
+    QUAT,
+    ROOM,
+    ROW,
+    SCALES,
+    WORKGROUP,
+    Drawing,
+)
 
 COLUMNS = {
-    "means": slice(0, 3),
-    "opacity_logits": slice(3, 4),
-    "quats": slice(4, 8),
-    "log_scales": slice(8, 11),
-    "raw_colours": slice(12, 15),
+    "means": MEAN,
+    "opacity_logits": OPACITY,
+    "quats": QUAT,
+    "log_scales": SCALES,
+    "raw_colours": slice(COLOURS.start, COLOURS.stop - 1),  # the range follows from the mean
 }
-"""Of a row of raw parameters, by the names of a GaussianMap; the last is left free."""
-COUNT_AT = 11
+"""Of a row of raw parameters, by the names of a GaussianMap."""
+COUNT_AT = SCALES.stop
 """Of a row of first moments: the count of steps, in the gap behind the scales."""
 LOSSES, VOLUMES, WATER, VIEW, RESULTS = 0, 1, 2, 7, 10
 """Places of what a step comes to among the vectors that are read, and their number."""
@@ -102,7 +112,7 @@ class MapOnGpu:
         self._count = len(parameters["means"])
         with self.device.lock:
             if not self._rows or self._count > self._rows["room"]:
-                room = int(1.25 * self._count)
+                room = int(ROOM * self._count)
                 names = ("raw", "first", "second")
                 self._rows = {name: self.device.buffer(ROW * room) for name in names}
                 self._rows["room"] = room
@@ -182,7 +192,7 @@ class MapOnGpu:
         """[N] of the drawn view, as a renderer says it."""
         with self.device.lock:
             (found,) = self.device.read([(self.drawing.named()["radius"], self._count)])
-        return torch.from_numpy(found.copy())
+        return torch.from_numpy(found)
 
     def finish(self, adam: SelectiveAdam, errors: bool) -> Outcome | None:
         """Compare with the picture, differentiate, and move the Gaussians that were visible.
@@ -203,6 +213,7 @@ class MapOnGpu:
                 self.drawing.make_room(hits)
                 return None
         adam.count_skipped(left_out)
+        of_tiles = torch.from_numpy(losses[0]).view(rows, columns, 4)[..., 3] if errors else None
         found = results.reshape(RESULTS, 4).astype(np.float64)
         g_viewmat = np.zeros((4, 4), np.float32)
         g_viewmat[:3] = found[VIEW : VIEW + 3]
@@ -210,9 +221,7 @@ class MapOnGpu:
             self._loss(found),
             torch.from_numpy(found[WATER : WATER + 5, :3].astype(np.float32)),
             torch.from_numpy(g_viewmat),
-            torch.from_numpy(losses[0].reshape(rows, columns, 4)[..., 3].copy())
-            if errors
-            else None,
+            of_tiles,
         )
 
     def _loss(
@@ -246,7 +255,7 @@ class MapOnGpu:
         self._planned = wanted
 
     def _write(self, view: Observed) -> None:
-        at, write = self.drawing.named(), self.device.write
+        write = self.device.write
         width, height = view.size
         _, columns = tile_grid(width, height)
         weights = self.weights
@@ -263,9 +272,7 @@ class MapOnGpu:
         floats = np.array([*numbers, *(-R.T @ t), view.inverse_scale, *water.ravel()], np.float32)
         bits = np.concatenate([np.array(whole, np.uint32), floats.view(np.uint32)])
         write(self._small["step"], bits)
-        write(at["camera"], view.camera)
-        write(at["tiles_drawn"], view.tiles_drawn)
-        write(at["listed"], np.array([self._count], np.uint32))
+        self.drawing.look(view.camera, view.tiles_drawn)
         write(self._pixels["observed"], view.pixels)
 
     def _write_gains(
