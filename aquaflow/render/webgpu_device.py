@@ -239,20 +239,20 @@ def shared_device() -> Device:
 
 
 _PARTS = {
-    "project": ("camera", "footprint", "reach"),
-    "hits": ("camera", "reach"),
+    "project": ("numbers", "camera", "footprint", "reach"),
+    "hits": ("camera", "reach", "scan"),
     "ranges": ("camera",),
     "blend": ("camera",),
     "blend_backward": ("camera",),
-    "project_backward": ("camera", "footprint"),
+    "project_backward": ("camera", "footprint", "add_up"),
     "sort": (),
-    "sum": (),
-    "activate": ("step",),
-    "compose": ("step",),
+    "sum": ("scan",),
+    "activate": ("step", "add_up"),
+    "compose": ("numbers", "step"),
     "loss": ("step",),
-    "compose_backward": ("step",),
-    "adam": ("step",),
-    "reduce": (),
+    "compose_backward": ("step", "add_up"),
+    "adam": ("numbers", "step"),
+    "reduce": ("add_up",),
 }
 """Files that come before each file of kernels: WGSL has no include."""
 

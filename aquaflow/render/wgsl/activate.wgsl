@@ -6,8 +6,6 @@
 @group(0) @binding(2) var<storage, read_write> gaussians: array<vec4f>;
 @group(0) @binding(3) var<storage, read_write> volumes: array<vec4f>;  // [blocks]
 
-var<workgroup> sums: array<f32, 256>;
-
 fn softplus(x: vec3f) -> vec3f {
   let y = COLOUR_SHARPNESS * x;
   return (max(y, vec3f(0)) + log(1 + exp(-abs(y)))) / COLOUR_SHARPNESS;
@@ -17,7 +15,7 @@ fn softplus(x: vec3f) -> vec3f {
 fn activate(@builtin(global_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u,
             @builtin(local_invocation_index) thread: u32) {
   let i = id.x;
-  sums[thread] = 0;
+  var volume = 0.0;
   if (i < step.size.w) {
     let mean = raw[4 * i]; let log_scale = raw[4 * i + 2].xyz;
     let opacity = 1 / (1 + exp(-mean.w));
@@ -25,11 +23,8 @@ fn activate(@builtin(global_invocation_id) id: vec3u, @builtin(workgroup_id) gro
     gaussians[4 * i + 1] = raw[4 * i + 1];
     gaussians[4 * i + 2] = vec4f(exp(log_scale), 0);
     gaussians[4 * i + 3] = vec4f(softplus(raw[4 * i + 3].xyz), distance(mean.xyz, step.centre.xyz));
-    sums[thread] = exp(log_scale.x + log_scale.y + log_scale.z);
+    volume = exp(log_scale.x + log_scale.y + log_scale.z);
   }
-  for (var half = 128u; half > 0; half /= 2) {
-    workgroupBarrier();
-    if (thread < half) { sums[thread] += sums[thread + half]; }
-  }
-  if (thread == 0) { volumes[group.x] = vec4f(sums[0], 0, 0, 0); }
+  let total = add_up(thread, vec4f(volume, 0, 0, 0));
+  if (thread == 0) { volumes[group.x] = total; }
 }

@@ -18,10 +18,7 @@ struct Rates {
 @group(0) @binding(8) var<storage, read> results: array<vec4f>;  // [0] losses, [1] sum of volumes
 @group(0) @binding(9) var<storage, read_write> state: array<atomic<u32>>;  // [0] hits, [1] rows left out
 
-fn is_small(x: vec4f) -> bool { return all(abs(x) < vec4f(LARGEST_GRADIENT)); }
-fn is_sound(x: vec4f) -> bool {
-  return is_number(x.x) && is_number(x.y) && is_number(x.z) && is_number(x.w) && is_small(x);
-}
+fn is_sound(x: vec4f) -> bool { return all_finite(x) && all(abs(x) < vec4f(LARGEST_GRADIENT)); }
 
 fn moved(at: u32, g: vec4f, learning: vec4f, correction: vec2f) {
   let m = first[at] + rates.rest.y * (g - first[at]);
@@ -37,7 +34,7 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
   if (i >= step.size.w || radius_px[i] <= 0) { return; }
   let loss = results[0];
   if (atomicLoad(&state[0]) > rates.counts.y) { return; }
-  if (!is_number(loss.x) || !is_number(loss.y) || !is_number(loss.z) || !is_number(results[1].x)) { return; }
+  if (!all_finite(vec4f(loss.xyz, results[1].x))) { return; }
   let mean = raw[4 * i]; let log_scale = raw[4 * i + 2].xyz; let colour = raw[4 * i + 3].xyz;
   let g0 = gradients[4 * i]; let g3 = gradients[4 * i + 3];
   let ray = mean.xyz - step.centre.xyz;

@@ -17,9 +17,3 @@ const VECTORS: u32 = 4;
 // colours, (slopes -b/a and -b/c, conic a and b). log2 of alpha at the pixel (x, y) is
 // qa dx^2 + qb dx dy + qc dy^2 + log2 opacity, with dx = x - u, dy = y - v and pixel centres at whole
 // numbers.
-
-// WGSL lets a compiler assume that numbers are finite, so what is asked for are the bits.
-fn is_finite(x: f32) -> bool { return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u; }
-fn all_finite(x: vec4f) -> bool {
-  return is_finite(x.x) && is_finite(x.y) && is_finite(x.z) && is_finite(x.w);
-}

@@ -39,7 +39,7 @@ fn compose(@builtin(workgroup_id) tile: vec3u, @builtin(global_invocation_id) pi
   if (step.flags.x != 0) {
     let residual = abs(shown - colour_of(packed));
     let worst = max(residual.r, max(residual.g, residual.b));
-    counts = counts && is_number(worst) && K * worst <= step.weights.w;
+    counts = counts && is_finite(worst) && K * worst <= step.weights.w;
   }
   mask[p] = select(0.0, K, counts);
 }

@@ -9,17 +9,9 @@
 @group(0) @binding(6) var<storage, read_write> behind: array<f32>;  // [H, W] dL/d(all that was drawn)
 @group(0) @binding(7) var<storage, read_write> waters: array<vec4f>;  // [tiles, 5]
 
-var<workgroup> sums: array<vec4f, 256>;
-
 fn sum_over_tile(tile: u32, row: u32, thread: u32, own: vec3f) {
-  sums[thread] = vec4f(own, 0);
-  for (var half = 128u; half > 0; half /= 2) {
-    workgroupBarrier();
-    if (thread < half) { sums[thread] += sums[thread + half]; }
-  }
-  workgroupBarrier();
-  if (thread == 0) { waters[5 * tile + row] = sums[0]; }
-  workgroupBarrier();
+  let total = add_up(thread, vec4f(own, 0));
+  if (thread == 0) { waters[5 * tile + row] = total; }
 }
 
 @compute @workgroup_size(TILE_PX, TILE_PX)

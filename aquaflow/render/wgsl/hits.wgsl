@@ -11,38 +11,27 @@
 @group(0) @binding(7) var<storage, read_write> owners: array<u32>;  // Gaussian of each hit
 @group(0) @binding(8) var<storage, read_write> starts: array<u32>;  // [N] first hit of each Gaussian
 
-var<workgroup> sums: array<u32, 256>;
-
-// The inclusive sums of a block of 256 Gaussians.
-fn sum_block(k: u32, thread: u32) -> u32 {
+fn hits_of(k: u32) -> u32 {
   var own = 0u;
   if (k < camera.counts.x) { own = hits[order[k]]; }
-  sums[thread] = own;
-  for (var step = 1u; step < 256; step *= 2) {
-    workgroupBarrier();
-    var earlier = 0u;
-    if (thread >= step) { earlier = sums[thread - step]; }
-    workgroupBarrier();
-    sums[thread] += earlier;
-  }
-  workgroupBarrier();
   return own;
 }
 
 @compute @workgroup_size(256)
 fn count_hits(@builtin(global_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u,
               @builtin(local_invocation_index) thread: u32) {
-  _ = sum_block(id.x, thread);
-  if (thread == 255) { before[group.x] = sums[255]; }
+  let all = scan(thread, hits_of(id.x));
+  if (thread == 255) { before[group.x] = all; }
 }
 
 @compute @workgroup_size(256)
 fn list_hits(@builtin(global_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u,
              @builtin(local_invocation_index) thread: u32) {
-  let own = sum_block(id.x, thread);
+  let own = hits_of(id.x);
+  let after = before[group.x] + scan(thread, own);
   if (id.x >= camera.counts.x || own == 0) { return; }
   let i = order[id.x];
-  var next = before[group.x] + sums[thread] - own;
+  var next = after - own;
   starts[i] = next;
   let s0 = splats[VECTORS * i]; let s1 = splats[VECTORS * i + 1]; let s3 = splats[VECTORS * i + 3];
   let box = tile_box(s0.xy, s1.zw, camera.size.zw);

@@ -9,8 +9,6 @@
 @group(0) @binding(6) var<storage, read_write> gradients: array<vec4f>;  // [N, VECTORS]
 @group(0) @binding(7) var<storage, read_write> view: array<vec4f>;  // [blocks, 3] rows of the view matrix
 
-var<workgroup> sums: array<vec4f, 256>;
-
 // q is of length one; the length of the quaternion has no effect. g: dL/dE, in rows.
 fn quat_gradient(q: vec4f, inverse_norm: f32, g: mat3x3f) -> vec4f {
   let w = q.x; let x = q.y; let y = q.z; let z = q.w;
@@ -24,14 +22,8 @@ fn quat_gradient(q: vec4f, inverse_norm: f32, g: mat3x3f) -> vec4f {
 }
 
 fn sum_over_block(block: u32, row: u32, thread: u32, own: vec4f) {
-  sums[thread] = own;
-  for (var step = 128u; step > 0; step /= 2) {
-    workgroupBarrier();
-    if (thread < step) { sums[thread] += sums[thread + step]; }
-  }
-  workgroupBarrier();
-  if (thread == 0) { view[3 * block + row] = sums[0]; }
-  workgroupBarrier();
+  let total = add_up(thread, own);
+  if (thread == 0) { view[3 * block + row] = total; }
 }
 
 @compute @workgroup_size(256)

@@ -20,5 +20,3 @@ fn radial(x: u32, y: u32, size: vec2u) -> f32 {
   let at = 2 * vec2f(f32(x), f32(y)) / max(vec2f(size - 1), vec2f(1)) - 1;
   return exp(-dot(at, at) / (2 * RADIAL_VARIANCE));
 }
-
-fn is_number(x: f32) -> bool { return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u; }

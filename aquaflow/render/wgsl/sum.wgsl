@@ -5,8 +5,6 @@
 @group(0) @binding(1) var<storage, read_write> table: array<u32>;
 @group(0) @binding(2) var<storage, read_write> total: array<u32>;
 
-var<workgroup> sums: array<u32, 256>;
-
 @compute @workgroup_size(256)
 fn sum(@builtin(local_invocation_index) thread: u32) {
   let share = (size.x + 255) / 256;
@@ -14,20 +12,12 @@ fn sum(@builtin(local_invocation_index) thread: u32) {
   let end = min(first + share, size.x);
   var own = 0u;
   for (var k = first; k < end; k++) { own += table[k]; }
-  sums[thread] = own;
-  for (var step = 1u; step < 256; step *= 2) {
-    workgroupBarrier();
-    var before = 0u;
-    if (thread >= step) { before = sums[thread - step]; }
-    workgroupBarrier();
-    sums[thread] += before;
-  }
-  workgroupBarrier();
-  var next = sums[thread] - own;
+  let through = scan(thread, own);
+  var next = through - own;
   for (var k = first; k < end; k++) {
     let here = table[k];
     table[k] = next;
     next += here;
   }
-  if (thread == 255) { total[0] = sums[255]; }
+  if (thread == 255) { total[0] = through; }
 }
