@@ -11,8 +11,6 @@ import time
 from collections.abc import Callable, Sequence
 from statistics import median
 
-import torch
-
 from aquaflow.base.errors import first_line
 from aquaflow.render.contract import Renderer
 from aquaflow.render.example_scene import SMALL, Size, SplatScene, height_field
@@ -61,10 +59,8 @@ def step_seconds(renderer: Renderer, scene: SplatScene) -> float:
     began = time.perf_counter()
     while len(times) < 2 or (time.perf_counter() - began < LIMIT_S and len(times) < MOST_STEPS):
         leaves, start = scene.leaves(renderer.device), time.perf_counter()
-        drawn = scene.drawn_by(renderer, leaves)
-        incoming = [g.to(drawn.image) for g in (scene.g_image, scene.g_alpha)]
-        found = torch.autograd.grad([drawn.image, drawn.alpha], leaves, incoming)
-        found[-1].cpu()  # waits for the device
+        _, gradients = scene.differentiated_by(renderer, leaves)
+        gradients[-1].cpu()  # waits for the device
         times.append(time.perf_counter() - start)
         if len(times) == 1:
             began = time.perf_counter()

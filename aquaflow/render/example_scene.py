@@ -77,6 +77,16 @@ class SplatScene:
         K = self.K.to(viewmat.device)
         return renderer(*gaussians, viewmat, K, self.size.width, self.size.height)
 
+    def differentiated_by(
+        self,
+        renderer: Renderer,
+        leaves: Sequence[Tensor],  # five of [N, ...], then [4, 4], as NAMES, that ask for gradients
+    ) -> tuple[Rendering, tuple[Tensor, ...]]:
+        """The picture, and the gradients of ``leaves`` for the scene's gradient of a loss."""
+        drawn = self.drawn_by(renderer, leaves)
+        incoming = [g.to(drawn.image) for g in (self.g_image, self.g_alpha)]
+        return drawn, torch.autograd.grad([drawn.image, drawn.alpha], leaves, incoming)
+
 
 def height_field(size: Size, seed: int = 0) -> SplatScene:
     """Gaussians all over the picture, 1 to 5 m away, as wide on the image as a map's."""

@@ -254,10 +254,7 @@ def drawn_and_differentiated(
 ) -> list[Tensor]:
     """[H, W, 5] colours, range and alpha, then the gradients of NAMES, drawn from inputs of
     ``dtype``; float64 and on the CPU, wherever the renderer draws."""
-    leaves = scene.leaves(renderer.device, dtype)
-    drawn = scene.drawn_by(renderer, leaves)
-    incoming = [g.to(drawn.image) for g in (scene.g_image, scene.g_alpha)]
-    gradients = torch.autograd.grad([drawn.image, drawn.alpha], leaves, incoming)
+    drawn, gradients = scene.differentiated_by(renderer, scene.leaves(renderer.device, dtype))
     picture = torch.cat([drawn.image, drawn.alpha[..., None]], 2).detach()
     return [tensor.cpu().double() for tensor in (picture, *gradients)]
 

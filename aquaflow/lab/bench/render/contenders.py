@@ -161,8 +161,7 @@ def measure_blend_limit(isa: str) -> BlendLimit:
     leaves, fastest = scene.leaves(), {FORWARD_STAGE: float("inf"), BACKWARD_STAGE: float("inf")}
     with torch_threads(1):
         for _ in range(ATTEMPTS):
-            drawn = scene.drawn_by(renderer, leaves)
-            torch.autograd.grad([drawn.image, drawn.alpha], leaves, [scene.g_image, scene.g_alpha])
+            scene.differentiated_by(renderer, leaves)
             stages = renderer.stage_ms()
             fastest = {name: min(ms, stages[name]) for name, ms in fastest.items()}
     pairs = COVERING.n * COVERING.pixels
