@@ -5,8 +5,9 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,6 +28,9 @@ from aquaflow.render.library import STAGES, Library, NativeUnavailableError, loa
 from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
 from aquaflow.render.tensor_address import pointer
 
+Held = TypeVar("Held")
+"""What a pool holds."""
+
 
 class _ContextPool:
     """Native contexts at rest; their buffers are reused by later forward passes."""
@@ -43,24 +47,33 @@ def _free_all(library: Library, idle: deque[int]) -> None:
         library.free_context(idle.pop())
 
 
-class _Lease:
-    """One context, held from a forward pass until its graph is gone."""
+class Lease(Generic[Held]):
+    """Something of a pool, held from a forward pass until its graph is gone."""
 
-    def __init__(self, pool: _ContextPool) -> None:
-        self.pool = pool
+    def __init__(self, idle: deque[Held], make: Callable[[], Held]) -> None:
+        """Of what is ``idle``, or a new one."""
+        self._idle = idle
         try:
-            self.context = pool.idle.pop()
+            self.held = idle.pop()
         except IndexError:
-            self.context = pool.library.new_context()
+            self.held = make()
 
     def __del__(self) -> None:
-        if hasattr(self, "context"):
-            self.pool.idle.append(self.context)
+        if hasattr(self, "held"):
+            self._idle.append(self.held)
+
+
+class _ContextLease(Lease[int]):
+    """One native context."""
+
+    def __init__(self, pool: _ContextPool) -> None:
+        self._pool = pool
+        super().__init__(pool.idle, pool.library.new_context)
 
     def call(self, kernel: str, *arguments: object) -> None:
         """Run a kernel on the context and keep its stage times, which outlive the lease."""
-        self.pool.library.call(kernel, self.context, *arguments)
-        self.pool.stage_ms = self.pool.library.stage_ms(self.context)
+        self._pool.library.call(kernel, self.held, *arguments)
+        self._pool.stage_ms = self._pool.library.stage_ms(self.held)
 
 
 class CpuRenderer:
@@ -137,7 +150,7 @@ class _Rasterise(torch.autograd.Function):
         visible = torch.empty(n, dtype=torch.bool)
         radius_px = torch.empty(n)
         gaussians = (means, quats, scales, opacities, colours)
-        lease = _Lease(pool)
+        lease = _ContextLease(pool)
         sizes = (n, channels, width, height, threads)
         inputs = map(pointer, (*gaussians, viewmat, intrinsics))
         outputs = (pointer(image), pointer(alpha), pointer(visible, torch.bool), pointer(radius_px))

@@ -10,6 +10,7 @@ import logging
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from aquaflow.render.contract import (
     check_inputs,
     tile_grid,
 )
-from aquaflow.render.cpu import cpu_renderer
+from aquaflow.render.cpu import Lease, cpu_renderer
 from aquaflow.render.webgpu_device import missing, shared_device
 from aquaflow.render.webgpu_drawing import COLOURS, MEAN, OPACITY, QUAT, ROW, SCALES, Drawing
 
@@ -126,22 +127,9 @@ class WgpuRenderer:
             drawn = self._on_processor(leaves, camera)
             return torch.autograd.grad([drawn.image, drawn.alpha], leaves, [g_image, g_alpha])
 
-    def lease(self) -> _Lease:
+    def lease(self) -> Lease[Drawing]:
         """Buffers that no other drawing uses."""
-        try:
-            return _Lease(self._idle, self._idle.pop())
-        except IndexError:
-            return _Lease(self._idle, Drawing(self._device))
-
-
-class _Lease:
-    """Buffers of a drawing, held until its graph is gone."""
-
-    def __init__(self, idle: deque[Drawing], drawing: Drawing) -> None:
-        self._idle, self.drawing = idle, drawing
-
-    def __del__(self) -> None:
-        self._idle.append(self.drawing)
+        return Lease(self._idle, partial(Drawing, self._device))
 
 
 @dataclass(frozen=True)
@@ -203,7 +191,7 @@ class _Rasterise(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         gaussians = (means, quats, scales, opacities, colours)
         ctx.lease, ctx.camera, ctx.renderer = renderer.lease(), camera, renderer
-        colours_drawn, rest, radius_px = ctx.lease.drawing.draw(
+        colours_drawn, rest, radius_px = ctx.lease.held.draw(
             _pack(*gaussians),
             camera_bits(viewmat, camera.K, camera.width, camera.height, len(means)),
             drawn_tiles(camera.active, camera.width, camera.height),
@@ -229,7 +217,7 @@ class _Rasterise(torch.autograd.Function):
         incoming[..., :channels] = g_image
         behind = (image * g_image).sum(2) - rest * g_alpha
         try:
-            rows, viewmat = ctx.lease.drawing.differentiate(behind.numpy(), incoming.numpy())
+            rows, viewmat = ctx.lease.held.differentiate(behind.numpy(), incoming.numpy())
         except Exception as error:  # as in drawing
             ctx.renderer.leave_gpu(error)
             found = ctx.renderer.gradients_on_processor(inputs, ctx.camera, g_image, g_alpha)
