@@ -30,6 +30,8 @@ Figures = dict[str, float]
 LIMIT_S = 3600.0
 """An attempt that takes longer is stopped; gsplat's kernels take tens of minutes to compile on a
 small board, TensorRT's engines minutes."""
+SOFTWARE = "software"
+"""Figure of an adapter: 1 of a program, 0 of a GPU."""
 NO_KERNEL = "no kernel image"
 """How CUDA words kernels that were compiled for other GPUs."""
 
@@ -96,7 +98,7 @@ def draw(make: Callable[[], Renderer] | None = None) -> Figures:
 
 
 def draw_on_adapter() -> Figures:
-    """The same by wgpu.
+    """The same by wgpu, and whether its adapter is a program that stands in for a GPU (SOFTWARE).
 
     Raises:
         AquaFlowError: as :func:`draw`; or the adapter failed, and the processor drew.
@@ -107,7 +109,7 @@ def draw_on_adapter() -> Figures:
     figures = draw(lambda: renderer)
     if (reason := renderer.failed) is not None:
         raise AquaFlowError(f"{reason}; update its driver, or set mapping.renderer: cpu")
-    return figures
+    return {**figures, SOFTWARE: float(renderer.is_software)}
 
 
 def _adapters() -> tuple[str, ...]:

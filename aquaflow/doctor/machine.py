@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aquaflow.doctor.attempts import Attempt, Figures, apart
+from aquaflow.doctor.attempts import SOFTWARE, Attempt, Figures, apart
 
 if TYPE_CHECKING:
     from aquaflow.render.gsplat import Gpu
@@ -133,8 +133,6 @@ class MachineProbes:
 
 CUDA, TENSORRT = "CUDAExecutionProvider", "TensorrtExecutionProvider"
 """onnxruntime's names."""
-SOFTWARE = "(CPU, "
-"""In the words for an adapter that is a program; see render/webgpu_device.py."""
 
 
 def findings(machine: MachineProbes) -> list[CheckResult]:
@@ -194,7 +192,7 @@ def _webgpu(machine: MachineProbes) -> CheckResult:
         )
     taken, *others = tried.adapters
     found = f"{taken} {_drew(tried.figures)}{''.join(f'; also {each}' for each in others)}"
-    if SOFTWARE in taken:
+    if tried.figures.get(SOFTWARE):
         used = "maps are drawn on the processor: this is a program, and slower"
     else:
         used = "maps are drawn on it where that is the fastest"

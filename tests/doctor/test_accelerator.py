@@ -11,7 +11,7 @@ from rich.console import Console
 
 from aquaflow.doctor import CheckResult, MachineProbes, print_findings, to_json
 from aquaflow.doctor import machine as accelerator
-from aquaflow.doctor.attempts import Attempt
+from aquaflow.doctor.attempts import SOFTWARE, Attempt
 from aquaflow.render.gsplat import Gpu
 
 ORIN = Gpu("Orin", "8.7", 7.4, "2.8.0", "12.6", ("sm_87",))
@@ -101,7 +101,8 @@ def test_every_makers_gpu_is_tried_where_wgpu_is_installed() -> None:
 
 
 def test_a_program_that_stands_in_for_a_gpu_is_said_to_be_one() -> None:
-    found = found_on("no CUDA", CPU_ONLY, False, wgpu=replace(DREW, adapters=(LAVAPIPE,)))
+    program = Attempt({**DREW.figures, SOFTWARE: 1.0}, adapters=(LAVAPIPE,))
+    found = found_on("no CUDA", CPU_ONLY, False, wgpu=program)
     assert "this is a program, and slower" in found["WebGPU"].used_for
     failed = found_on("no CUDA", CPU_ONLY, False, wgpu=Attempt(failed="it has no driver"))
     assert (failed["WebGPU"].found, failed["WebGPU"].advice) == (
