@@ -10,9 +10,9 @@ import pytest
 from aquaflow.config import Config
 from aquaflow.config.presets import merge
 from aquaflow.dive.replay import map_recording
-from aquaflow.render.webgpu_device import Device
 from aquaflow.sources import open_recording
 from tests.device.whole_dives import FEW_STEPS, write_dimmed_dive
+from tests.render.lost_device import lose_after
 from tests.render.render_scenes import needs_adapter, needs_compiler
 
 pytestmark = [needs_adapter, needs_compiler, pytest.mark.ci]
@@ -46,19 +46,10 @@ def test_a_dive_whose_gpu_is_lost_while_it_refines_is_whole(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = metrics_of(recording, "cpu", tmp_path / "cpu")
-    whole, count = Device.submit, 0
-
-    def submit(self: Device, *arguments: Any, **named: Any) -> None:
-        nonlocal count
-        count += 1
-        if count > 60:
-            raise RuntimeError("Parent device is lost")
-        whole(self, *arguments, **named)
-
-    monkeypatch.setattr(Device, "submit", submit)
+    count = lose_after(monkeypatch, 60, "submit")
     monkeypatch.setattr("aquaflow.mapping.gpu_steps.SAVE_EVERY", 5)  # of 30 steps of refining
     found = metrics_of(recording, "wgpu", tmp_path / "lost")
-    assert count == 61
+    assert count() == 61
     assert found["renderer"].startswith("cpu (")
     assert found["complete"]
     # Four of thirty steps may be lost, where the map is still improving fast.

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +16,8 @@ from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.transfer_counts import transfers
 from aquaflow.render.views import View
 from aquaflow.render.webgpu import WgpuRenderer
-from aquaflow.render.webgpu_device import Device
 from tests.mapping.mapping_scenes import CAMERA, cloud, floor, path, picture, view_of
+from tests.render.lost_device import lose_after
 from tests.render.render_scenes import needs_adapter, needs_compiler, relative_error
 
 pytestmark = [needs_adapter, needs_compiler]
@@ -186,31 +184,13 @@ def test_a_loss_that_is_not_finite_moves_nothing() -> None:
     assert mapper.steps == 1
 
 
-def lose_after(monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
-    """Let the device be lost after so many calls, for good."""
-    count = 0
-
-    def failing(whole: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **named: Any) -> Any:
-            nonlocal count
-            count += 1
-            if count > calls:
-                raise RuntimeError("Parent device is lost")
-            return whole(*arguments, **named)
-
-        return call
-
-    for name in ("submit", "read", "write"):
-        monkeypatch.setattr(Device, name, failing(getattr(Device, name)))
-
-
 @pytest.mark.parametrize("calls", range(0, 120, 6))
 def test_a_device_that_is_lost_at_any_call_leaves_a_whole_map(
     monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
     monkeypatch.setattr(gpu_steps, "SAVE_EVERY", 4)
     mapper, here = mapped(WgpuRenderer(1)), mapped(CpuRenderer(1))
-    lose_after(monkeypatch, calls)
+    lose_after(monkeypatch, calls, "submit", "read", "write")
     for each in (mapper, here):
         take_steps(each, 12)
     assert mapper.renderer.name == "cpu"

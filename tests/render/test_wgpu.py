@@ -17,8 +17,9 @@ from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.example_scene import Size, height_field
 from aquaflow.render.webgpu import WgpuRenderer
-from aquaflow.render.webgpu_device import Adapter, Device, missing, shared_device
+from aquaflow.render.webgpu_device import Adapter, missing, shared_device
 from aquaflow.render.webgpu_drawing import LEAST_HITS, SORTED, Drawing
+from tests.render.lost_device import lose_after
 from tests.render.render_scenes import (
     NAMES,
     Scene,
@@ -90,24 +91,6 @@ def test_buffers_of_a_larger_map_serve_a_smaller_one() -> None:
 # --- a GPU that fails ---------------------------------------------------------------------------
 
 
-class LostError(Exception):
-    """As drivers word it."""
-
-
-def lose(monkeypatch: pytest.MonkeyPatch, call: str, after: int) -> None:
-    """Let the device be lost at its ``after``-th call of this kind."""
-    whole, count = getattr(Device, call), 0
-
-    def fail(self: Device, *arguments: Any, **named: Any) -> Any:
-        nonlocal count
-        count += 1
-        if count > after:
-            raise LostError("Parent device is lost\nand more words")
-        return whole(self, *arguments, **named)
-
-    monkeypatch.setattr(Device, call, fail)
-
-
 @needs_adapter
 @needs_compiler
 @pytest.mark.parametrize(
@@ -118,7 +101,7 @@ def test_a_device_that_is_lost_leaves_its_drawing_to_the_processor(
 ) -> None:
     scene, renderer = random_scene(0), WgpuRenderer()
     wanted, wanted_gradients = draw_and_differentiate(CpuRenderer(1), scene)
-    lose(monkeypatch, call, after)
+    lose_after(monkeypatch, after, call)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             got, gradients = draw_and_differentiate(renderer, scene)
