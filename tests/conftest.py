@@ -136,8 +136,20 @@ def pictures(tmp_path: Path) -> Path:
     return folder
 
 
+def unchanged(folder: Path) -> Iterator[Path]:
+    """``folder``, for tests that only read it: others read it at the same time."""
+
+    def files() -> dict[Path, tuple[int, int]]:
+        found = ((path, path.stat()) for path in sorted(folder.rglob("*")) if path.is_file())
+        return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in found}
+
+    before = files()
+    yield folder
+    assert files() == before, f"a test changed {folder}, which others share: copy it first"
+
+
 @pytest.fixture(scope="session")
-def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A synthetic dive of 24 small pictures, made once."""
 
     def make(folder: Path) -> None:
@@ -146,18 +158,18 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
         write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
 
-    return made_once(tmp_path_factory, "small_recording", make)
+    yield from unchanged(made_once(tmp_path_factory, "small_recording", make))
 
 
 @pytest.fixture(scope="session")
-def small_dive(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_dive(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The dive folder of the small recording, mapped once."""
 
     def make(folder: Path) -> None:
         ran = run_aquaflow("map", small_recording, "--out", folder, *QUICK)
         assert ran.code == 0, ran.err
 
-    return made_once(tmp_path_factory, "small_dive", make)
+    yield from unchanged(made_once(tmp_path_factory, "small_dive", make))
 
 
 @pytest.fixture(scope="session")

@@ -223,10 +223,8 @@ def test_a_scale_bar_reaches_the_dive_and_the_page_shows_the_new_unit(dive: Path
 @pytest.mark.parametrize(
     "bad", [{"places": [[0, 0, 1]]}, {"length_m": 0}, {"length_m": "2"}, {"sigma_m": float("nan")}]
 )
-def test_a_scale_bar_that_is_none_is_refused(small_dive: Path, bad: dict[str, Any]) -> None:
-    page = open_dive(
-        small_dive, ViewerConfig(port=0, splats=100), lambda *_: pytest.fail("it was kept")
-    )
+def test_a_scale_bar_that_is_none_is_refused(dive: Path, bad: dict[str, Any]) -> None:
+    page = open_dive(dive, ViewerConfig(port=0, splats=100), lambda *_: pytest.fail("it was kept"))
     given = {"places": [[0, 0, 1], [1, 0, 1]], "length_m": 2.0, "sigma_m": 0.01} | bad
     try:
         with pytest.raises(InputError):
