@@ -9,6 +9,8 @@ from aquaflow.doctor.machine import CheckResult, MachineProbes
 
 LUXONIS_USB_VENDOR = "03e7"
 """Vendor number of Luxonis' processor (Movidius) on USB, hexadecimal."""
+OTHER_OPENCVS = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
+"""Packages that write into the same folder ``cv2``: whichever came last is what is imported."""
 ARPHRD_CAN = "280"
 """Value of ``/sys/class/net/*/type`` for a CAN interface (linux/if_arp.h)."""
 
@@ -20,18 +22,27 @@ def video(machine: MachineProbes) -> CheckResult:
             "video files",
             "no OpenCV",
             "neither videos nor images can be read",
-            "run 'pip install opencv-python-headless'",
+            "run 'pip install opencv-contrib-python-headless'",
         )
     import cv2
 
     backends = {cv2.videoio_registry.getBackendName(b) for b in cv2.videoio_registry.getBackends()}
     found = f"OpenCV {cv2.__version__}"
+    others = " and ".join(name for name in OTHER_OPENCVS if machine.version(name) is not None)
+    if others:
+        return CheckResult(
+            "video files",
+            f"{found}, and {others} in the same folder",
+            "pictures are read by whichever was installed last",
+            f"run 'pip uninstall {others.replace(' and', '')}', then "
+            "'pip install --force-reinstall --no-deps opencv-contrib-python-headless'",
+        )
     if "FFMPEG" not in backends:
         return CheckResult(
             "video files",
             f"{found} without FFmpeg",
             "folders of images are read, videos are not",
-            "run 'pip install opencv-python-headless', which carries FFmpeg",
+            "run 'pip install opencv-contrib-python-headless', which carries FFmpeg",
         )
     return CheckResult("video files", f"{found} with FFmpeg", "videos and images are read")
 

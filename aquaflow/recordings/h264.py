@@ -89,7 +89,7 @@ def decode_units(
     try:
         capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
     except (TypeError, cv2.error) as error:
-        raise InputError("decoding recorded video needs opencv-python-headless 5") from error
+        raise InputError("recorded video needs opencv-contrib-python-headless 5") from error
     damaged = False
     with DecoderLog() as decoder, ExitStack() as stack:
         stack.callback(capture.release)

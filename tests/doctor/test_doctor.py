@@ -148,6 +148,16 @@ def test_video_support_is_that_of_the_installed_opencv(machine):
     assert "with FFmpeg" in named(real, "video files").found
 
 
+def test_a_second_opencv_in_the_same_folder_is_named_with_what_removes_it(machine):
+    both = bare(
+        machine.root,
+        module_present=lambda name: name == "cv2",
+        version=lambda name: "5.0" if name == "opencv-python" else None,
+    )
+    assert "opencv-python in the same folder" in named(both, "video files").found
+    assert "'pip uninstall opencv-python'" in named(both, "video files").advice
+
+
 def test_cameras_are_named_once_whatever_their_number_of_nodes(machine):
     for number, index in ((0, 0), (1, 1)):
         put(machine.root, f"dev/video{number}")

@@ -11,7 +11,7 @@ from typing import Any
 
 from aquaflow import __version__
 
-PACKAGES = ("torch", "numpy", "opencv-python-headless", "pycolmap")
+PACKAGES = ("torch", "numpy", "opencv-contrib-python-headless", "pycolmap")
 ON_GPU = ("gsplat", "onnxruntime-gpu")
 """Those whose version changes a benchmark's numbers, and on a GPU also these."""
 

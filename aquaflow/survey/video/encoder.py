@@ -61,7 +61,7 @@ class VideoEncoder:
         if not writer.isOpened():
             raise InputError(
                 f"OpenCV cannot write VP9 video to {self._path.parent}; give another "
-                "--out, or install opencv-python-headless from PyPI"
+                "--out, or install opencv-contrib-python-headless from PyPI"
             )
         return writer
 
