@@ -181,7 +181,9 @@ class Initialiser:
         return found
 
     def _explain(self, frames: list[MatchedFrame]) -> Initialised | None:
-        """The best explanation of these frames; None where it is not good enough."""
+        """The best explanation of these frames; where parallax is small, of those that it explains,
+        since one whose matches are a period off bends the geometry of the others. None where it is
+        not good enough."""
         camera, pixels = self.reference.camera, self._pixels_reference
         hypotheses = Hypotheses(camera, pixels, frames, self._config)
         result = hypotheses.best()
@@ -191,8 +193,12 @@ class Initialiser:
         self.contradicted = little and explained < self._config.min_explained
         if result is None or not self._trustworthy(hypotheses, explained, result, parallax_px):
             return None
-        if little and not self._is_decided(hypotheses, result):
-            return None
+        if little:
+            good = hypotheses.explained_frames(result.bundle)
+            if len(good) < len(frames):
+                return self._explain(good)
+            if not self._is_decided(hypotheses, result):
+                return None
         return Initialised(
             frames, result.bundle.T, result.bundle.camera, result.residual_px, result.focal_sigma
         )
@@ -213,12 +219,10 @@ class Initialiser:
 
     def _is_decided(self, hypotheses: Hypotheses, result: BundleResult) -> bool:
         """True if depths and direction are known, however little parallax there is: at the noise
-        that matches are known to have, not that of the few that are left, without a rival, and for
-        every frame: one whose matches are a period off bends the geometry of the others."""
+        that matches are known to have, not that of the few that are left, and without a rival."""
         worse = max(self._config.sigma_px / result.residual_px, 1.0)
         known = worse * hypotheses.depth_sigma(result) <= self._config.max_depth_sigma
-        least = hypotheses.least_explained(result.bundle)
-        return known and not hypotheses.ambiguous and least >= self._config.min_explained
+        return known and not hypotheses.ambiguous
 
     @property
     def _pixels_reference(self) -> Array:
@@ -387,10 +391,13 @@ class Hypotheses:
         """Share of all information in front of its camera and within a pixel of its match."""
         return self._explained_share(bundle, self._waiting)
 
-    def least_explained(self, bundle: Bundle) -> float:
-        """The same share of the frame that has least of it."""
-        views = zip(self._waiting, bundle.T, strict=True)
-        return min(self._explained_share(replace(bundle, T=[T]), [frame]) for frame, T in views)
+    def explained_frames(self, bundle: Bundle) -> list[MatchedFrame]:
+        """Frames of which enough is explained each."""
+        return [
+            frame
+            for frame, T in zip(self._waiting, bundle.T, strict=True)
+            if self._explained_share(replace(bundle, T=[T]), [frame]) >= self._config.min_explained
+        ]
 
     def depth_sigma(self, result: BundleResult) -> float:
         """Median relative sigma of the depths that :meth:`best` found."""
