@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -283,6 +284,11 @@ class MappingConfig(StageConfig):
     max_gaussians: int = Field(150_000, ge=1000, description="hard cap")
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"
+    )
+    lpips_weights: Path | None = Field(
+        None,
+        description="folder with vgg16-397923af.pth, alexnet-owt-7be5be79.pth or both, as "
+        "torchvision publishes them, for LPIPS; null: the one that torch keeps such files in",
     )
     held_out_most: Lab[int] = Field(
         256,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.base.clocks.wall import Deadline
-from aquaflow.dive.held_out_example import Fidelity, HeldOut
+from aquaflow.dive.held_out_example import Fidelity, HeldOut, Perceived
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
@@ -20,7 +20,8 @@ from aquaflow.mapping.restoration import (
     to_bytes,
 )
 from aquaflow.mapping.scene import RenderedMap
-from aquaflow.render.image_metrics import lpips, psnr, ssim
+from aquaflow.render.image_metrics import flip, psnr, ssim
+from aquaflow.render.lpips import load_lpips
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View, in_time
 from aquaflow.slam import Slam
@@ -106,7 +107,6 @@ def _examine(mapper: Mapper, view: View, tone: ShownTone) -> HeldOut:
     if mapper.medium.active:
         restored = restored_picture(mapper.scene, view, shown)
     amplification = None if restored is None else restored.amplification
-    perceptual, _ = lpips(rendered, real)
     return HeldOut(
         view.frame_index,
         view.image,
@@ -114,8 +114,18 @@ def _examine(mapper: Mapper, view: View, tone: ShownTone) -> HeldOut:
         None if restored is None else restored.picture_bytes(tone),
         psnr(rendered, real),
         ssim(rendered, real),
-        perceptual,
+        _perceived(mapper, rendered, real),
         picture_out(torch.where(shown.alpha > SOLID, shown.z, 0.0).to(torch.float32)),
         None if restored is None else restored.confidence_bytes(),
         None if amplification is None else picture_out(amplification),
     )
+
+
+def _perceived(
+    mapper: Mapper,
+    rendered: npt.NDArray[np.float32],  # [H, W, 3]
+    real: npt.NDArray[np.float32],  # [H, W, 3]
+) -> Perceived:
+    networks, _ = load_lpips(mapper.config.lpips_weights)
+    by = {name: network(rendered, real) for name, network in networks.items()}
+    return Perceived(flip(rendered, real), by.get("vgg"), by.get("alex"))

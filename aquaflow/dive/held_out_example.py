@@ -20,6 +20,16 @@ class Fidelity(NamedTuple):
     ssim: float
 
 
+class Perceived(NamedTuple):
+    """How far apart the two look to a person; None of what cannot be measured here."""
+
+    flip: float | None
+    """aquaflow/render/image_metrics.py"""
+    lpips: float | None
+    lpips_alex: float | None
+    """By the features of VGG and of AlexNet (aquaflow/render/lpips.py)."""
+
+
 @dataclass(frozen=True)
 class HeldOut:
     """One held-out frame after its pose was refined."""
@@ -31,7 +41,7 @@ class HeldOut:
     """[H, W, 3], or [H, W, 4] with alpha where open water was removed."""
     psnr: float
     ssim: float
-    lpips: float | None
+    perceived: Perceived
     z: npt.NDArray[np.float32] | None = None
     """[H, W] rendered range, 0 where the map is not solid; map units unless something else is
     said."""

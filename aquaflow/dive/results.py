@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from aquaflow import __version__
-from aquaflow.dive.held_out_example import HeldOut
+from aquaflow.dive.held_out_example import HeldOut, Perceived
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.render.image_metrics import lpips_network
 from aquaflow.render.transfer_counts import transfers
 from aquaflow.slam import Slam
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -28,6 +27,8 @@ PROTOCOL = {
     "resolution": "the width that was mapped, undistorted",
     "ssim": "11x11 Gaussian window, sigma 1.5 px, zero-padded, mean over channels",
     "psnr": "mean over held-out frames of the PSNR of each",
+    "flip": "mean over held-out frames of the mean of each, at 67 pixels for each degree",
+    "lpips": "version 0.1; lpips by VGG16's features, lpips_alex by AlexNet's",
     "as_tracked": "psnr and ssim before that refinement: pose as tracked, moved with the mapped "
     "frames before and after",
     "ate": "see `aquaflow lab evaluate`, which knows the truth",
@@ -131,7 +132,11 @@ def metrics(
     classes = [tracked.frame_class for tracked in results]
     posed = sum(tracked.T_wc is not None for tracked in results)
     renderer = slam.renderer
-    lpips_reason = "mapping is off" if renderer is None else lpips_network()[1]
+    lpips_reason: str | None = "mapping is off"
+    if renderer is not None:
+        from aquaflow.render.lpips import load_lpips  # loads torch
+
+        _, lpips_reason = load_lpips(slam.config.mapping.lpips_weights)
     counts = {"frames": len(results) + len(dropped), "tracked": posed}
     counts |= {
         "lost": classes.count(FrameClass.LOST),
@@ -141,7 +146,6 @@ def metrics(
         "common_frames": classes.count(FrameClass.COMMON),
     }
     drift = scale_drift(slam.graph.snapshot, slam.keyframes.keyframes)
-    perceptual = [example.lpips for example in held_out if example.lpips is not None]
     as_tracked = [example.as_tracked for example in held_out if example.as_tracked is not None]
     return counts | {
         "complete": True,
@@ -162,7 +166,7 @@ def metrics(
         "ssim": _mean([example.ssim for example in held_out]),
         "psnr_as_tracked": _mean([before.psnr for before in as_tracked]),
         "ssim_as_tracked": _mean([before.ssim for before in as_tracked]),
-        "lpips": _mean(perceptual),
+        **_perceived([example.perceived for example in held_out]),
         "lpips_reason": lpips_reason,
         "heldout_frames": len(held_out),
         "ate_rmse_m_se3": None,
@@ -177,6 +181,14 @@ def metrics(
         "seed": slam.config.seed,
         "version": __version__,
         "protocol": PROTOCOL,
+    }
+
+
+def _perceived(examples: list[Perceived]) -> dict[str, float | None]:
+    by_name = {name: [getattr(each, name) for each in examples] for name in Perceived._fields}
+    return {
+        name: _mean([value for value in values if value is not None])
+        for name, values in by_name.items()
     }
 
 

@@ -172,6 +172,7 @@ PACKAGES = (
     Package("kornia", "kornia", "prior-peers", "the priors xfeat and aliked"),
     Package("gsplat", "gsplat", "gpu", "maps on a GPU with CUDA"),
     Package("wgpu", "wgpu", "gpu-any", "maps on a GPU of any maker"),
+    Package("lpips", "lpips", "lpips", "LPIPS of the held-out views"),
     Package("onnx", "onnx", "export", "exporting a trained prior"),
     Package("onnxscript", "onnxscript", "export", "exporting a trained prior"),
     Package("pycolmap", "pycolmap", "peers", "COLMAP beside AquaFlow in `aquaflow lab bench`"),
@@ -181,6 +182,8 @@ OTHER_BUILDS = {"onnxruntime": ("onnxruntime-gpu",)}
 INSTALLED_OTHERWISE = {
     # What it asks for would replace the build of torch that is installed.
     "gsplat": "pip install --no-deps gsplat",
+    # Its code is not run, so what that asks for is not needed: torchvision, of torch's own build.
+    "lpips": "pip install --no-deps lpips",
 }
 """Commands for packages that an extra does not install well."""
 

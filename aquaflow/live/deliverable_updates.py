@@ -269,7 +269,7 @@ class Interim:
             "sub_maps": len(np.unique(poses.sub_maps)),
             "loops": slam.graph.loops,
             "gaussians": gaussians,
-            **dict.fromkeys(("psnr", "ssim", "lpips")),
+            **dict.fromkeys(("psnr", "ssim", "flip", "lpips", "lpips_alex")),
             "heldout_frames": 0,
             "stage_ms": {},
             "warnings": self._run.calibration_warnings + slam.failures.defects(),

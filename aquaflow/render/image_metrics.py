@@ -1,10 +1,6 @@
-"""Picture quality: PSNR, SSIM, LPIPS and, for restored colours, PSNR after a gain per channel."""
+"""Picture quality: PSNR, SSIM, FLIP and, for restored colours, PSNR after a gain per channel."""
 
 from __future__ import annotations
-
-import functools
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +10,6 @@ Mask = npt.NDArray[np.bool_]
 
 PSNR_LIMIT_DB = 100.0
 """Reported for equal pictures, whose PSNR is infinite and has no JSON number."""
-
-LPIPS_BACKBONE = "vgg16-397923af.pth"
-"""The file that torchvision keeps in torch's hub folder."""
 
 
 def psnr(
@@ -72,36 +65,16 @@ def ssim(
     return float((luminance * (2.0 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean())
 
 
-def lpips(
+def flip(
     image: Image,  # [H, W, 3] in [0, 1]
     reference: Image,  # [H, W, 3] in [0, 1]
-) -> tuple[float | None, str | None]:
-    """LPIPS (VGG) and None, or None and the reason why it cannot be measured here.
-
-    Nothing is downloaded: a vehicle's computer has no network, and a metric must not need one.
-    """
-    network, reason = lpips_network()
-    if network is None:
-        return None, reason
-    import torch
-
-    def tensor(picture: Image) -> torch.Tensor:  # [1, 3, H, W] in [-1, 1]
-        return torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None] * 2.0 - 1.0
-
-    with torch.no_grad():
-        return float(network(tensor(image), tensor(reference))), None
-
-
-@functools.lru_cache(maxsize=1)
-def lpips_network() -> tuple[Any | None, str | None]:
-    """The LPIPS network and None, or None and the reason why there is none."""
+) -> float | None:
+    """Mean difference that somebody sees who changes between two pictures, 0 to 1 (FLIP, Andersson
+    et al. 2020, at 67 pixels for each degree); None where its package is not installed."""
     try:
-        import lpips as package  # type: ignore[import-not-found]
+        import flip_evaluator  # type: ignore[import-untyped,unused-ignore]
     except ImportError:
-        return None, "the Python package 'lpips' is not installed"
-    import torch
-
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_BACKBONE
-    if not weights.is_file():
-        return None, f"the VGG weights of LPIPS are not at {weights}"
-    return package.LPIPS(net="vgg", verbose=False).eval(), None
+        return None
+    pictures = (np.ascontiguousarray(each, np.float32) for each in (reference, image))
+    seen, _, _ = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False)
+    return float(np.asarray(seen, np.float64).mean())

@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -25,8 +26,9 @@ from tests.small_recording import FRAMES, HEIGHT, WIDTH
 
 METRICS = {
     *("frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames"),
-    *("gaussians", "wall_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips"),
-    *("lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
+    *("gaussians", "wall_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "flip"),
+    *("lpips", "lpips_alex", "lpips_reason", "heldout_frames"),
+    *("ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
     *("scale_source", "scale_sigma", "unit", "north", "gravity_sigma_deg", "telemetry"),
     *("utc_start", "utc_source", "utc_sigma_s"),
     *("renderer", "prior", "device", "seed", "version", "protocol"),
@@ -75,6 +77,7 @@ def test_metrics_have_the_stable_keys_and_agree_with_the_table(small_dive: Path)
     assert metrics["mapping_frames"] == classes.count("mapping")
     assert metrics["common_frames"] == classes.count("common")
     assert metrics["heldout_frames"] == len(HELD_OUT)
+    assert (metrics["flip"] is None) == (find_spec("flip_evaluator") is None)
     assert (metrics["unit"] == "m") == (metrics["scale_sigma"] is not None)
     assert (metrics["north"] == "first keyframe") == (metrics["gravity_sigma_deg"] is None)
     for stage in metrics["stage_ms"].values():

@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.config import Config
 from aquaflow.dive.held_out import examine_held_out
-from aquaflow.dive.held_out_example import HeldOut, mean_amplification
+from aquaflow.dive.held_out_example import HeldOut, Perceived, mean_amplification
 from aquaflow.slam import Slam
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
@@ -15,7 +15,9 @@ PICTURE = np.zeros((48, 64, 3), np.uint8)
 
 def held_out(amplification: list[list[float]] | None) -> HeldOut:
     known = None if amplification is None else np.array(amplification, np.float32)
-    return HeldOut(8, PICTURE, PICTURE, None, 20.0, 0.5, None, amplification=known)
+    return HeldOut(
+        8, PICTURE, PICTURE, None, 20.0, 0.5, Perceived(None, None, None), amplification=known
+    )
 
 
 def test_a_dive_without_a_map_has_nothing_to_examine() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from aquaflow.config import Config
-from aquaflow.dive.held_out_example import HeldOut
+from aquaflow.dive.held_out_example import HeldOut, Perceived
 from aquaflow.dive.map_file import water_of
 from aquaflow.dive.metric_outputs import water_in
 from aquaflow.dive.results import (
@@ -36,7 +37,7 @@ def tracked(index: int, frame_class: FrameClass, sub_map: int = 0, posed: bool =
 
 
 def held_out(psnr: float, ssim: float) -> HeldOut:
-    return HeldOut(8, PICTURE, PICTURE, None, psnr, ssim, None)
+    return HeldOut(8, PICTURE, PICTURE, None, psnr, ssim, Perceived(0.1, None, 0.2))
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +85,7 @@ def test_every_frame_is_counted_once(slam: Slam) -> None:
 def test_quality_is_the_mean_over_held_out_frames(slam: Slam) -> None:
     numbers = metrics(slam, RESULTS, [], [held_out(20.0, 0.5), held_out(30.0, 0.7)], 1.0)
     assert (numbers["psnr"], numbers["ssim"], numbers["heldout_frames"]) == (25.0, 0.6, 2)
+    assert (numbers["flip"], numbers["lpips"], numbers["lpips_alex"]) == (0.1, None, 0.2)
 
 
 def test_without_held_out_frames_quality_is_null_and_not_zero(slam: Slam) -> None:
@@ -92,9 +94,13 @@ def test_without_held_out_frames_quality_is_null_and_not_zero(slam: Slam) -> Non
     assert numbers["ssim"] is None
 
 
-def test_an_lpips_that_was_not_measured_has_a_reason(slam: Slam) -> None:
+def test_an_lpips_that_was_not_measured_has_a_reason(
+    slam: Slam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = tmp_path / "hub"
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     numbers = metrics(slam, RESULTS, [], [held_out(20.0, 0.5)], 1.0)
-    assert (numbers["lpips"] is None) == bool(numbers["lpips_reason"])
+    assert "lpips" in numbers["lpips_reason"] or str(hub) in numbers["lpips_reason"]
 
 
 def test_only_posed_frames_have_a_pose(slam: Slam) -> None:

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 TARGETS = [(python, machine) for python in PYTHONS for machine in ("x86_64", "aarch64")]
-EXTRAS = ("dev", "oak", "peers", "prior-peers", "s3-tests")
+EXTRAS = ("dev", "lpips", "oak", "peers", "prior-peers", "s3-tests")
 """Everything but ``gpu``, whose gsplat is installed without what it asks for, and ``prior-gpu``,
 which stands in ``prior``'s place and exists for fewer of them."""
 CUDA_BUILD_OF_TORCH = re.compile(r"nvidia-|cuda-|triton$")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,13 +14,6 @@ from aquaflow.render import image_metrics as images
 
 def picture(seed: int = 0, shape: tuple[int, int, int] = (24, 32, 3)) -> np.ndarray:
     return np.random.default_rng(seed).uniform(size=shape)
-
-
-@pytest.fixture(autouse=True)
-def _forget_the_lpips_network():
-    images.lpips_network.cache_clear()
-    yield
-    images.lpips_network.cache_clear()
 
 
 def test_psnr_of_a_known_difference():
@@ -101,43 +93,20 @@ def test_gain_is_fitted_under_the_mask():
     np.testing.assert_allclose(images.channel_gain(a, b, mask), 0.5, rtol=1e-6)
 
 
-def test_lpips_without_its_package_says_so(monkeypatch):
-    monkeypatch.setitem(sys.modules, "lpips", None)
-
-    value, reason = images.lpips(picture(), picture())
-
-    assert value is None
-    assert "'lpips' is not installed" in reason
+def test_flip_of_equal_pictures_is_zero_and_grows_with_the_difference():
+    pytest.importorskip("flip_evaluator", reason="it has no wheel for this processor")
+    assert images.flip(picture(), picture()) == 0.0
+    near, far = (images.flip(np.clip(picture() + by, 0, 1), picture()) for by in (0.02, 0.3))
+    assert 0.0 < near < far < 1.0
 
 
-def test_lpips_without_its_weights_names_the_place_and_downloads_nothing(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace())
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-
-    value, reason = images.lpips(picture(), picture())
-
-    assert value is None
-    assert str(tmp_path) in reason
+def test_flip_of_black_and_white_is_one():
+    """Andersson et al. 2020: the largest difference that there is."""
+    pytest.importorskip("flip_evaluator", reason="it has no wheel for this processor")
+    black = np.zeros((24, 32, 3))
+    assert images.flip(black, black + 1.0) == pytest.approx(1.0, abs=0.05)
 
 
-def test_lpips_gets_pictures_from_minus_one_to_one(monkeypatch, tmp_path):
-    weights = tmp_path / "hub" / "checkpoints" / images.LPIPS_BACKBONE
-    weights.parent.mkdir(parents=True)
-    weights.touch()
-    seen = []
-
-    class Network:
-        def __init__(self, **_: object) -> None: ...
-
-        def eval(self):
-            return self
-
-        def __call__(self, a, b):
-            seen.append((tuple(a.shape), float(a.min()), float(b.max())))
-            return 0.25
-
-    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=Network))
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-
-    assert images.lpips(np.zeros((8, 8, 3)), np.ones((8, 8, 3))) == (0.25, None)
-    assert seen == [((1, 3, 8, 8), -1.0, 1.0)]
+def test_flip_without_its_package_is_unknown(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    assert images.flip(picture(), picture()) is None

@@ -222,6 +222,7 @@ def _row(part: AblatedPart, runs: list[Row]) -> dict[str, Any]:
         "part": part.name,
         "psnr": mean([run["psnr"] for run in whole]),
         "ssim": mean([run.get("ssim") for run in whole]),
+        "flip": mean([run.get("flip") for run in whole]),
         "lpips": mean([run.get("lpips") for run in whole]),
         "gaussians": mean([run.get("gaussians") for run in whole]),
         "posed_pct": mean([_posed_pct(run) for run in whole]),
@@ -247,6 +248,7 @@ def _cpu_ms(run: Row) -> float | None:
 SHOWN = (
     ("psnr", "PSNR dB", ".2f"),
     ("ssim", "SSIM", ".3f"),
+    ("flip", "FLIP", ".3f"),
     ("lpips", "LPIPS", ".3f"),
     ("gaussians", "Gaussians", ".0f"),
     ("posed_pct", "posed %", ".0f"),

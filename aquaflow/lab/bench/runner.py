@@ -28,7 +28,8 @@ LIMIT_S = 3600.0
 KEYS = (
     "frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames",
     "gaussians", "wall_s", "cpu_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim",
-    "psnr_as_tracked", "ssim_as_tracked", "lpips", "lpips_reason", "heldout_frames",
+    "psnr_as_tracked", "ssim_as_tracked", "flip", "lpips", "lpips_alex", "lpips_reason",
+    "heldout_frames",
     "ate_rmse_m_se3", "ate_rmse_m_sim3", "ate_pct_se3", "ate_pct_sim3",
     "rpe", "drift_pct", "depth_absrel", "medium_error", "hue_shift_deg",
     "chroma_difference", "lightness_ratio", "restored_psnr", "raw_psnr",

@@ -119,6 +119,7 @@ COLUMNS = (
     PSNR,
     Column("as tracked dB", _number("psnr_as_tracked"), ".2f"),
     Column("SSIM", lambda row: row["ssim"], ".3f"),
+    Column("FLIP", _number("flip"), ".3f"),
     Column("depth %", lambda row: _times_100(row["depth_absrel"]), ".1f"),
     Column("water %", attenuation_error_pct, ".0f"),
     Column("hue °", lambda row: row["hue_shift_deg"], ".1f"),

@@ -32,7 +32,8 @@ from aquaflow.lab.evaluation.truth import PositionTable, read_truth
 from aquaflow.lab.synthetic.water import load_medium
 
 COPIED_METRICS = (
-    "psnr", "ssim", "psnr_as_tracked", "ssim_as_tracked", "lpips", "lpips_reason",
+    "psnr", "ssim", "psnr_as_tracked", "ssim_as_tracked", "flip", "lpips", "lpips_alex",
+    "lpips_reason",
 )  # fmt: skip
 """Measured while mapping, on the held-out frames; the evaluation repeats them."""
 

@@ -102,8 +102,9 @@ def _views(result: Values) -> list[str]:
     if result.get("psnr") is None:
         return []
     said = f"PSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}"
-    if result.get("lpips") is not None:
-        said += f", LPIPS {result['lpips']:.3f}"
+    for key, name in (("flip", "FLIP"), ("lpips", "LPIPS"), ("lpips_alex", "LPIPS (AlexNet)")):
+        if result.get(key) is not None:
+            said += f", {name} {result[key]:.3f}"
     rows = [_row("as the camera saw them", said)]
     if result.get("psnr_as_tracked") is not None:
         psnr, ssim = result["psnr_as_tracked"], result["ssim_as_tracked"]

@@ -46,6 +46,7 @@ TILES = (
     ("psnr", "{:.2f}", "dB PSNR, held-out frames"),
     ("psnr_as_tracked", "{:.2f}", "dB PSNR, pose as tracked"),
     ("ssim", "{:.3f}", "SSIM, held-out frames"),
+    ("flip", "{:.3f}", "FLIP, held-out frames"),
     ("lpips", "{:.3f}", "LPIPS, held-out frames"),
     ("ate_rmse_m_sim3", "{:.3g}", "path error (ATE, Sim(3))"),
 )
