@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow import __version__
-from aquaflow.dive.held_out_example import HeldOut, Perceived
+from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.transfer_counts import transfers
 from aquaflow.slam import Slam
@@ -146,6 +146,7 @@ def metrics(
         "common_frames": classes.count(FrameClass.COMMON),
     }
     drift = scale_drift(slam.graph.snapshot, slam.keyframes.keyframes)
+    perceived = [example.perceived for example in held_out]
     as_tracked = [example.as_tracked for example in held_out if example.as_tracked is not None]
     return counts | {
         "complete": True,
@@ -166,7 +167,9 @@ def metrics(
         "ssim": _mean([example.ssim for example in held_out]),
         "psnr_as_tracked": _mean([before.psnr for before in as_tracked]),
         "ssim_as_tracked": _mean([before.ssim for before in as_tracked]),
-        **_perceived([example.perceived for example in held_out]),
+        "flip": _mean([each.flip for each in perceived if each.flip is not None]),
+        "lpips": _mean([each.lpips for each in perceived if each.lpips is not None]),
+        "lpips_alex": _mean([each.lpips_alex for each in perceived if each.lpips_alex is not None]),
         "lpips_reason": lpips_reason,
         "heldout_frames": len(held_out),
         "ate_rmse_m_se3": None,
@@ -181,14 +184,6 @@ def metrics(
         "seed": slam.config.seed,
         "version": __version__,
         "protocol": PROTOCOL,
-    }
-
-
-def _perceived(examples: list[Perceived]) -> dict[str, float | None]:
-    by_name = {name: [getattr(each, name) for each in examples] for name in Perceived._fields}
-    return {
-        name: _mean([value for value in values if value is not None])
-        for name, values in by_name.items()
     }
 
 
