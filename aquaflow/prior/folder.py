@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
 from aquaflow.base.errors import InputError, path_of_key, words_of
+from aquaflow.base.errors.regular_file import sha256_of_stream
 from aquaflow.config.stage import StageConfig
 from aquaflow.prior.contract import RangeUnit
 
@@ -76,8 +76,6 @@ CARD = "prior.json"
 """Names the network, its inputs and its licence."""
 ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
 """Files of the network."""
-READ_BYTES = 1 << 20
-"""Read at a time for the checksum."""
 
 
 class PriorCard(StageConfig):
@@ -140,8 +138,5 @@ def read_card(folder: Path) -> PriorCard:
 
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file of any size."""
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(READ_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
+        return sha256_of_stream(file)

@@ -4,7 +4,6 @@ published weights, from files alone (Zhang et al. 2018, version 0.1 of their pac
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +16,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import sha256_of_stream
 
 MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Of pictures in [-1, 1], as that package takes them off."""
 TINY = 1e-10
 """Keeps features that are all zero from a division by zero, as there."""
-CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -152,11 +151,9 @@ def _read(path: Path, digits: str) -> dict[str, Any]:
     """
     if not path.is_file():
         raise InputError(f"weights of LPIPS are not at {path}")
-    said = hashlib.sha256()
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
-            said.update(chunk)
-    if not said.hexdigest().startswith(digits):
+        found = sha256_of_stream(file)
+    if not found.startswith(digits):
         raise InputError(f"{path} is damaged or another file: its SHA-256 is not {digits}…")
     tensors: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     return tensors

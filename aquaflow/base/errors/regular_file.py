@@ -108,10 +108,15 @@ def sha256_regular(path: Path) -> str:
     Raises:
         OSError: as :func:`open_regular`.
     """
-    digest = hashlib.sha256()
     with open_regular(path) as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
+        return sha256_of_stream(stream)
+
+
+def sha256_of_stream(stream: BinaryIO) -> str:
+    """SHA-256 of what is left in ``stream``, however long, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    while block := stream.read(1 << 20):
+        digest.update(block)
     return digest.hexdigest()
 
 
