@@ -26,7 +26,7 @@ TINY = 1e-10
 
 @dataclass(frozen=True)
 class Backbone:
-    """The layers whose features are compared: numbers of ``conv`` are indices in torchvision's."""
+    """The layers whose features are compared, by their indices in torchvision's ``features``."""
 
     file: str
     """As torchvision publishes it; the digits are the first of its SHA-256."""
@@ -83,9 +83,8 @@ class Lpips:
     ) -> float:
         """0 for equal pictures; around 0.5 for pictures that have little in common."""
         pictures = np.stack([image, reference]).astype(np.float32)
-        kind = self._linear[0].dtype
-        there = torch.from_numpy(pictures).to(kind).permute(0, 3, 1, 2) * 2.0 - 1.0
-        mean, deviation = (torch.tensor(each).to(kind)[:, None, None] for each in (MEAN, DEVIATION))
+        there = torch.from_numpy(pictures).permute(0, 3, 1, 2) * 2.0 - 1.0
+        mean, deviation = (torch.tensor(each)[:, None, None] for each in (MEAN, DEVIATION))
         there, distance = (there - mean) / deviation, 0.0
         with torch.no_grad():
             for number, linear in enumerate(self._linear):
@@ -120,17 +119,22 @@ def load_lpips(folder: Path | None) -> tuple[dict[str, Lpips], str | None]:
     Args:
         folder: of the backbones' weights; None for the one that torch keeps such files in.
     """
+    return _load(folder or Path(torch.hub.get_dir()) / "checkpoints")
+
+
+@functools.cache
+def _load(folder: Path) -> tuple[dict[str, Lpips], str | None]:
+    """Once for all pictures, also what is missing: to find a file damaged takes all of its bytes."""
     found, missing = dict[str, Lpips](), list[str]()
     for name in BACKBONES:
         try:
-            found[name] = _load(name, folder or Path(torch.hub.get_dir()) / "checkpoints")
+            found[name] = _network(name, folder)
         except InputError as error:
             missing.append(str(error))
     return found, "; ".join(dict.fromkeys(missing)) or None
 
 
-@functools.cache
-def _load(name: str, folder: Path) -> Lpips:
+def _network(name: str, folder: Path) -> Lpips:
     """Raises InputError: a file is missing or damaged."""
     backbone, package = BACKBONES[name], importlib.util.find_spec("lpips")
     if package is None or package.origin is None:
