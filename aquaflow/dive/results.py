@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from aquaflow import __version__
-from aquaflow.dive.held_out_example import HeldOut
+from aquaflow.dive.held_out_example import HeldOut, Perceived
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.transfer_counts import transfers
 from aquaflow.slam import Slam
@@ -132,11 +132,6 @@ def metrics(
     classes = [tracked.frame_class for tracked in results]
     posed = sum(tracked.T_wc is not None for tracked in results)
     renderer = slam.renderer
-    lpips_reason: str | None = "mapping is off"
-    if renderer is not None:
-        from aquaflow.render.lpips import load_lpips  # loads torch
-
-        _, lpips_reason = load_lpips(slam.config.mapping.lpips_weights)
     counts = {"frames": len(results) + len(dropped), "tracked": posed}
     counts |= {
         "lost": classes.count(FrameClass.LOST),
@@ -146,7 +141,6 @@ def metrics(
         "common_frames": classes.count(FrameClass.COMMON),
     }
     drift = scale_drift(slam.graph.snapshot, slam.keyframes.keyframes)
-    perceived = [example.perceived for example in held_out]
     as_tracked = [example.as_tracked for example in held_out if example.as_tracked is not None]
     return counts | {
         "complete": True,
@@ -167,10 +161,7 @@ def metrics(
         "ssim": _mean([example.ssim for example in held_out]),
         "psnr_as_tracked": _mean([before.psnr for before in as_tracked]),
         "ssim_as_tracked": _mean([before.ssim for before in as_tracked]),
-        "flip": _mean([each.flip for each in perceived if each.flip is not None]),
-        "lpips": _mean([each.lpips for each in perceived if each.lpips is not None]),
-        "lpips_alex": _mean([each.lpips_alex for each in perceived if each.lpips_alex is not None]),
-        "lpips_reason": lpips_reason,
+        **_perceived(slam, [example.perceived for example in held_out]),
         "heldout_frames": len(held_out),
         "ate_rmse_m_se3": None,
         "ate_rmse_m_sim3": None,
@@ -187,8 +178,25 @@ def metrics(
     }
 
 
-def _mean(values: list[float]) -> float | None:
-    return round(float(np.mean(values)), 4) if values else None
+def _perceived(slam: Slam, views: list[Perceived]) -> dict[str, float | str | None]:
+    """Means over the views, and why LPIPS has none."""
+    reason: str | None = "mapping is off"
+    if slam.renderer is not None:
+        from aquaflow.render.lpips import load_lpips  # loads torch
+
+        _, reason = load_lpips(slam.config.mapping.lpips_weights)
+    return {
+        "flip": _mean([view.flip for view in views]),
+        "lpips": _mean([view.lpips for view in views]),
+        "lpips_alex": _mean([view.lpips_alex for view in views]),
+        "lpips_reason": reason,
+    }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Of those that are known; None where none is."""
+    known = [value for value in values if value is not None]
+    return round(float(np.mean(known)), 4) if known else None
 
 
 # --------------------------------------------------------------------------------------------------

@@ -100,6 +100,7 @@ def test_an_lpips_that_was_not_measured_has_a_reason(
     hub = tmp_path / "hub"
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     numbers = metrics(slam, RESULTS, [], [held_out(20.0, 0.5)], 1.0)
+    assert (numbers["lpips"] is None) == bool(numbers["lpips_reason"])
     assert "lpips" in numbers["lpips_reason"] or str(hub) in numbers["lpips_reason"]
 
 
