@@ -28,13 +28,13 @@ def video(machine: MachineProbes) -> CheckResult:
 
     backends = {cv2.videoio_registry.getBackendName(b) for b in cv2.videoio_registry.getBackends()}
     found = f"OpenCV {cv2.__version__}"
-    others = " and ".join(name for name in OTHER_OPENCVS if machine.version(name) is not None)
+    others = [name for name in OTHER_OPENCVS if machine.version(name) is not None]
     if others:
         return CheckResult(
             "video files",
-            f"{found}, and {others} in the same folder",
+            f"{found}, and {' and '.join(others)} in the same folder",
             "pictures are read by whichever was installed last",
-            f"run 'pip uninstall {others.replace(' and', '')}', then "
+            f"run 'pip uninstall {' '.join(others)}', then "
             "'pip install --force-reinstall --no-deps opencv-contrib-python-headless'",
         )
     if "FFMPEG" not in backends:
