@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.regular_file import sha256_of_stream
 
 MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -151,12 +151,15 @@ def _read(path: Path, digits: str) -> dict[str, Any]:
     """The tensors of a file whose SHA-256 begins with ``digits``.
 
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, or it cannot be read.
     """
     if not path.is_file():
         raise InputError(f"weights of LPIPS are not at {path}")
-    with path.open("rb") as file:
-        found = sha256_of_stream(file)
+    try:
+        with path.open("rb") as file:
+            found = sha256_of_stream(file)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {reason_of(error)}") from error
     if not found.startswith(digits):
         raise InputError(f"{path} is damaged or another file: its SHA-256 is not {digits}…")
     tensors: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)

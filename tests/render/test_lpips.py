@@ -141,6 +141,23 @@ def test_a_damaged_file_is_named_and_not_used(files: Path) -> None:
     assert f"{damaged} is damaged or another file" in reason
 
 
+def test_a_file_that_may_not_be_read_is_named_and_costs_its_backbone_alone(
+    files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed, whole = files / lpips.BACKBONES["vgg"].file, Path.open
+
+    def refused(path: Path, *arguments: Any) -> Any:
+        if path == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return whole(path, *arguments)
+
+    monkeypatch.setattr(Path, "open", refused)
+    networks, reason = load_lpips(files)
+    assert set(networks) == {"alex"}
+    assert reason is not None
+    assert f"{closed} cannot be read" in reason
+
+
 def test_without_the_package_of_its_weights_it_says_what_installs_them(
     files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
