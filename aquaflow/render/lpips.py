@@ -124,7 +124,7 @@ def load_lpips(folder: Path | None) -> tuple[dict[str, Lpips], str | None]:
 
 @functools.cache
 def _load(folder: Path) -> tuple[dict[str, Lpips], str | None]:
-    """Once for all pictures, also what is missing: to find a file damaged takes all of its bytes."""
+    """Once for all pictures, also what is missing: a damaged file is found by reading all of it."""
     found, missing = dict[str, Lpips](), list[str]()
     for name in BACKBONES:
         try:
