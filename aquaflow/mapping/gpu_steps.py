@@ -75,8 +75,13 @@ class GpuSteps:
         self._map.is_loaded = False
 
     def radius_px(self) -> Tensor:
-        """[N] of the view of the last step."""
-        return self._map.radius_px()
+        """[N] of the view of the last step; zeros, as of what is not seen, where the GPU failed
+        since."""
+        try:
+            return self._map.radius_px()
+        except Exception as error:  # as in a step
+            self._renderer.leave_gpu(error)
+            return torch.zeros(len(self._scene.gaussians))
 
     def _save(self, adam: SelectiveAdam) -> None:
         self._map.save(self._scene.gaussians.parameters, adam)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +11,23 @@ import pytest
 
 from aquaflow.config import Config
 from aquaflow.config.presets import merge
+from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.replay import map_recording
+from aquaflow.live.checkpoint.resume import resume_folder
+from aquaflow.live.live_dive import LiveDive
 from aquaflow.sources import open_recording
+from aquaflow.types import Frame
 from tests.device.whole_dives import FEW_STEPS, write_dimmed_dive
+from tests.live.live_scenes import VEHICLE, ToldFeed, caught_up
 from tests.render.lost_device import lose_after
 from tests.render.render_scenes import needs_adapter, needs_compiler
 
 pytestmark = [needs_adapter, needs_compiler, pytest.mark.ci]
 
 STEPS = merge(FEW_STEPS, {"optimiser": {"refine_steps": 30, "prune_every": 20}})
+
+CUT = 7
+"""Frames of the live dive before it is cut off."""
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +64,39 @@ def test_a_dive_whose_gpu_is_lost_while_it_refines_is_whole(
     assert found["complete"]
     # Four of thirty steps may be lost, where the map is still improving fast.
     assert found["psnr"] == pytest.approx(wanted["psnr"], abs=1.0)
+
+
+def test_a_live_dive_on_wgpu_is_gone_on_with_after_a_cut_and_outlives_its_gpu(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = [each for each in open_recording(recording).frames() if isinstance(each, Frame)]
+    with live_dive(tmp_path / "dive") as dive:
+        for frame in frames[:CUT]:
+            dive.parts.loop.take(frame)
+        caught_up(dive)
+        assert dive.parts.maps.renderer.name == "wgpu"
+        mapped = len(dive.parts.maps.mappers[0].gaussians)
+        dive.parts.checkpointer.take()
+        caught_up(dive)
+        assert dive.parts.checkpointer.taken == 1
+    with live_dive(tmp_path / "dive") as back:
+        assert len(back.parts.maps.mappers[0].gaussians) == mapped > 100
+        count = lose_after(monkeypatch, 20, "submit")
+        for frame in frames[CUT:]:
+            back.parts.loop.take(frame)
+        caught_up(back)
+        metrics = back.parts.run.finish([]).metrics
+    assert count() == 21
+    assert metrics["renderer"].startswith("cpu (")
+    assert metrics["tracked"] == metrics["frames"] == len(frames)
+    assert metrics["psnr"] > 15.0
+    assert not metrics["failures"]
+
+
+@contextmanager
+def live_dive(folder: Path) -> Iterator[LiveDive]:
+    """A live dive on wgpu in ``folder``, the one that was cut off there if there is one."""
+    settings = merge(VEHICLE.model_dump(mode="json"), {"mapping": {"renderer": "wgpu"}})
+    vehicle = VehicleConfig.model_validate(settings)
+    with closing(LiveDive("live", resume_folder(folder, new=False), ToldFeed(), vehicle)) as dive:
+        yield dive

@@ -16,8 +16,9 @@ from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.transfer_counts import transfers
 from aquaflow.render.views import View
 from aquaflow.render.webgpu import WgpuRenderer
+from aquaflow.render.webgpu_map import MapOnGpu
 from tests.mapping.mapping_scenes import CAMERA, cloud, floor, path, picture, view_of
-from tests.render.lost_device import lose_after
+from tests.render.lost_device import LostError, lose_after
 from tests.render.render_scenes import needs_adapter, needs_compiler, relative_error
 
 pytestmark = [needs_adapter, needs_compiler]
@@ -199,6 +200,23 @@ def test_a_device_that_is_lost_at_any_call_leaves_a_whole_map(
     assert all(torch.isfinite(each).all() for each in mapper.gaussians.parameters.values())
     lost = int((here.optimiser.adam.steps - mapper.optimiser.adam.steps).max())
     assert lost <= 4
+
+
+def test_a_device_that_is_lost_when_gaussians_are_pruned_leaves_a_whole_map(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapper = mapped(WgpuRenderer(1), PLAIN, prune_every=3)
+    mapper.gaussians.parameters["opacity_logits"][::7] = -6.0
+
+    def fail(*_: object) -> None:
+        raise LostError
+
+    monkeypatch.setattr(MapOnGpu, "radius_px", fail)
+    take_steps(mapper, 4)
+    assert mapper.renderer.name == "cpu"
+    assert mapper.steps == 4
+    assert 0 < len(mapper.gaussians) < 300
+    assert len(mapper.gaussians) == len(mapper.optimiser.adam.steps)
 
 
 def test_a_map_with_a_decoder_or_a_lamp_takes_its_steps_on_the_host(
