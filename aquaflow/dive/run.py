@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from aquaflow.base.errors import InputError, NotMappedError, printable
+from aquaflow.base.errors import InputError, NotMappedError, printable, times
 from aquaflow.base.stages import pace
 from aquaflow.config import Config
 from aquaflow.config.mapping import InsertionConfig, OptimiserConfig
@@ -274,7 +274,7 @@ class DiveRun:
         sub_maps = {tracked.sub_map for tracked in results if tracked.T_wc is not None}
         if len(sub_maps) > 1:
             self.notes.append(
-                f"tracking was lost {len(sub_maps) - 1} times: the dive has "
+                f"tracking was lost {times(len(sub_maps) - 1)}: the dive has "
                 f"{sub_maps_in_words([outputs.frame(number) for number in sub_maps])}"
             )
         camera = self.slam.tracker.camera

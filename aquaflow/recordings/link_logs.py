@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from datetime import datetime, timezone
 
+from aquaflow.base.errors import times
 from aquaflow.config.instruments import Nmea2000Config
 from aquaflow.config.link import CanConfig, SerialConfig
 from aquaflow.config.telemetry import AnyDevice, MavlinkConfig, NmeaConfig
@@ -59,7 +60,7 @@ class Tlog(ByteLog):
         self.notes = [f"{skipped} bytes of {self.path.name} belong to no record"] if skipped else []
         if clock.jumps:
             self.notes.append(
-                f"the clock of {self.path.name} was set {clock.jumps} times and gives no UTC"
+                f"the clock of {self.path.name} was set {times(clock.jumps)} and gives no UTC"
             )
 
 

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import times
 from aquaflow.config import SourceConfig
 from aquaflow.sources import CameraSource
 from aquaflow.types import Frame
@@ -89,7 +90,7 @@ class PictureCheck:
         elif self._repeated > MOST_SHARE * (count - 1):
             said.append(f"{self._repeated} of {count} pictures repeat the one before")
         if 0 < self._cuts <= MOST_SHARE * (count - 1):  # stills of a survey are all unlike
-            said.append(f"the scene changes from one picture to the next {self._cuts} times")
+            said.append(f"the scene changes from one picture to the next {times(self._cuts)}")
         return said
 
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from aquaflow.base.errors import times
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -113,10 +114,9 @@ class ConsistencyCounts:
         """A sentence for the user if there were findings."""
         if not self.found:
             return []
-        times = "once" if self.found == 1 else f"{self.found} times"
         last = self.findings[-1]
         return [
-            f"tracking was inconsistent {times}, last at frame {last.frame} ({last}); "
+            f"tracking was inconsistent {times(self.found)}, last at frame {last.frame} ({last}); "
             f"{self.found - self.unrepaired} repaired"
         ]
 

@@ -148,6 +148,11 @@ def _words(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()
 
 
+def times(count: int) -> str:
+    """How often, in words: ``once``, ``2 times``."""
+    return "once" if count == 1 else f"{count} times"
+
+
 def printable(name: str) -> str:
     r"""A file name to show: bytes that are not UTF-8 as ``\xe9``, a line break as ``\n``."""
     try:

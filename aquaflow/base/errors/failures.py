@@ -26,6 +26,7 @@ from aquaflow.base.errors import (
     is_device_full,
     is_full_disk,
     is_out_of_memory,
+    times,
 )
 
 log = logging.getLogger(__name__)
@@ -87,10 +88,9 @@ class Kind:
 
     def note(self) -> str:
         """One line for the user."""
-        times = "once" if self.count == 1 else f"{self.count} times"
         at = "" if self.first_frame is None else f", first at frame {self.first_frame}"
         ours = "; a defect in AquaFlow, please report it with log.jsonl" if self.defect else ""
-        return f"{self.stage} failed {times}{at} ({self.error} in {self.place}){ours}"
+        return f"{self.stage} failed {times(self.count)}{at} ({self.error} in {self.place}){ours}"
 
 
 class Failures:
