@@ -31,6 +31,7 @@ from aquaflow.tracking.pose.matcher import (
     pose_from_scratch,
     pose_problem,
 )
+from aquaflow.tracking.pose.solver import PoseProblem
 
 RECOVERED_SUPPORT = 0.2
 """Matched share x inlier share of a lost frame that is found again in a keyframe left last; twice
@@ -138,10 +139,22 @@ class WideSteps:
             if matched_share(keyframe.encoding, pair) < RECOVERED_SUPPORT:
                 continue
             T_fk = turning_step(pointmap, pair, known, camera, predicted)
-            if T_fk is not None:
+            if T_fk is not None and not self._is_denied(keyframe, encoding, camera, T_fk):
                 fuse(pointmap, pair, T_fk, camera, config.sigma_px)
                 return self._matcher.pose(keyframe, camera, pair, T_fk, T_fk)
         return None
+
+    def _is_denied(
+        self, keyframe: Keyframe, encoding: Encoding, camera: CameraModel, T_fk: Sim3
+    ) -> bool:
+        """True if keypoints, which have no double and took no part in the pose, are elsewhere:
+        matches that are tiles off all the way agree with each other."""
+        pixels_k, pixels = known_keypoints(keyframe, encoding, self._config.known_sigma)
+        if len(pixels) < LEAST_INLIERS:
+            return False
+        problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, SIGMA_PX)
+        agree = keypoint_error_px(problem, T_fk) < AGREEING_WIDTHS * camera.width
+        return bool(agree.mean() < LEAST_AGREEING)
 
     def _surest_first(
         self,
@@ -174,6 +187,8 @@ class WideSteps:
         return None
 
 
+Array = npt.NDArray[np.float64]
+
 # --------------------------------------------------------------------------------------------------
 # Poses that the keypoints of two pictures speak for, the best distinct ones.
 #
@@ -190,30 +205,47 @@ INLIER_PX = 4.0
 """Reprojection error of a keypoint that speaks for a pose already found."""
 SIGMA_PX = 1.0
 """Noise of a keypoint at wide baseline."""
+AGREEING_WIDTHS = 0.025
+"""Reprojection error, of the picture's width, of a keypoint that does not deny a pose: a wide step
+from depths just found is up to 0.02 off, and a tile 0.05 and more (real pool, 480 and 640 px)."""
+LEAST_AGREEING = 0.25
+"""Of the keypoints of known depth, those that agree with a pose, below which they deny it: 0.07 and
+0.09 over a jump of 12 s on the real pool, 0.55 of the worst right pose there."""
 
 
 def keypoint_poses(
     keyframe: Keyframe, encoding: Encoding, camera: CameraModel, known_sigma: float
 ) -> list[Sim3]:
     """T_fk, best supported first; empty where the keypoints agree on none."""
-    mine, theirs = match_keypoints(keyframe.encoding.keypoints, encoding.keypoints)
-    pixels_k = keyframe.encoding.keypoints.pixels[mine].astype(np.float64)
-    pixels = encoding.keypoints.pixels[theirs].astype(np.float64)
-    left = at_pixels(keyframe.pointmap.is_known(known_sigma), pixels_k)
+    pixels_k, pixels = known_keypoints(keyframe, encoding, known_sigma)
     poses: list[Sim3] = []
-    while len(poses) < HYPOTHESES and left.sum() >= LEAST_INLIERS:
-        problem = pose_problem(keyframe.pointmap, pixels_k[left], pixels[left], camera, SIGMA_PX)
+    while len(poses) < HYPOTHESES and len(pixels) >= LEAST_INLIERS:
+        problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, SIGMA_PX)
         pose = pose_from_scratch(problem, LEAST_INLIERS)
         if pose is None:
             break
         poses.append(pose)
-        error = np.linalg.norm(camera.project(pose.apply(problem.points)) - problem.pixels, axis=1)
-        rest = left.copy()
-        rest[left] = error >= INLIER_PX
-        if rest.sum() == left.sum():
+        rest = keypoint_error_px(problem, pose) >= INLIER_PX
+        if rest.all():
             break
-        left = rest
+        pixels_k, pixels = pixels_k[rest], pixels[rest]
     return poses
+
+
+def known_keypoints(
+    keyframe: Keyframe, encoding: Encoding, known_sigma: float
+) -> tuple[Array, Array]:
+    """[M, 2] px each: the keyframe's keypoints of known depth, and where a frame has them."""
+    mine, theirs = match_keypoints(keyframe.encoding.keypoints, encoding.keypoints)
+    pixels_k = keyframe.encoding.keypoints.pixels[mine].astype(np.float64)
+    known = at_pixels(keyframe.pointmap.is_known(known_sigma), pixels_k)
+    return pixels_k[known], encoding.keypoints.pixels[theirs[known]].astype(np.float64)
+
+
+def keypoint_error_px(problem: PoseProblem, T_fk: Sim3) -> Array:
+    """[M] distance of keypoints from where a pose puts them."""
+    there = problem.camera.project(T_fk.apply(problem.points))
+    return np.asarray(np.linalg.norm(there - problem.pixels, axis=1))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -223,8 +255,6 @@ def keypoint_poses(
 # one has just come to see: nothing there has a depth that a pose could be solved from. Matches
 # alone give the rotation and the direction of the step; its length comes from the few points that
 # are known or, without any, from the step before.
-
-Array = npt.NDArray[np.float64]
 
 MATCHES = 1500
 """Matches that the two-view pose is estimated from."""

@@ -201,6 +201,28 @@ def test_matches_that_agree_by_chance_give_no_depth_after_a_turn(
         assert (tracker.place_after_turn(at, frame, CAMERA, solved) is not None) == found
 
 
+@pytest.mark.parametrize(("off_px", "found"), [(0.0, True), (24.0, False)])
+def test_a_step_that_keypoints_of_known_depth_deny_is_none(off_px: float, found: bool) -> None:
+    """Matches that are tiles off all the way agree with each other, not with what has no double."""
+    store, T_wc = KeyframeStore(), pose((0.0, 0.45, 0.0), (0.25, 0.05, 0.0))
+    known = np.zeros((CAMERA.height, CAMERA.width), bool)
+    known[:40, :40] = True
+    keyframe = keyframe_at(HERE, store, known)
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((1, 1), (39, 39), (30, 2)).astype(np.float32)
+    descriptors = rng.normal(size=(30, 128)).astype(np.float32)
+    depth = FLOOR.depth(HERE)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    points = CAMERA.unproject(pixels.astype(np.float64)) * depth[:, None]
+    there = CAMERA.project(T_wc.inverse().apply(points)) + np.array([off_px, 0.0])
+    frame = PRIOR.encode(FLOOR.picture(T_wc), CAMERA)
+    keyframe.encoding.keypoints = Keypoints(pixels, descriptors)  # type: ignore[misc]
+    frame.keypoints = Keypoints(there.astype(np.float32), descriptors)
+    at = CurrentKeyframe(keyframe)
+    at.motion = T_wc.inverse()
+    tracker = KeyframeTracker(PRIOR, store, TrackingConfig())
+    assert (tracker.place_after_turn(at, frame, CAMERA, None) is not None) == found
+
+
 def test_a_pose_from_the_rim_of_what_is_known_is_replaced_after_a_turn() -> None:
     """One corner has depths, which are 10 % off: where that leads to, the rest does not fit."""
     store, config = KeyframeStore(), TrackingConfig()
