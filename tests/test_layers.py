@@ -15,7 +15,7 @@ from tests.statements import statements
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = (
-    {"cli", "api"},
+    {"__main__", "cli", "api"},
     {"survey", "live", "lab", "sim_drivers"},
     {
         *("slam", "dive", "recordings", "doctor", "calibration", "web"),
@@ -35,6 +35,8 @@ USERS_OF_DRIVERS = {"cli", "sim_drivers", "recordings"}
 
 LOOSE_MODULES = {"slam", "types"}
 """Modules right under ``aquaflow``; everything else lies in a folder."""
+PYTHONS = {"__init__", "__main__"}
+"""What Python itself looks for there."""
 
 HEIGHT = {family: -level for level, floor in enumerate(FLOORS) for family in floor}
 OWN = ("aquaflow", "drivers", "sim_drivers")
@@ -210,7 +212,7 @@ def test_every_folder_stands_on_one_of_four_floors() -> None:
     families = {family(module) for module in graph_of_files()}
     assert families == {name for floor in FLOORS for name in floor}
     assert len(FLOORS) == 4
-    assert {path.stem for path in (ROOT / "aquaflow").glob("*.py")} - {"__init__"} == LOOSE_MODULES
+    assert {path.stem for path in (ROOT / "aquaflow").glob("*.py")} - PYTHONS == LOOSE_MODULES
 
 
 def test_no_test_imports_another_test() -> None:

@@ -24,7 +24,12 @@ from aquaflow.base.storage.atomic import (
     write_json,
     write_yaml,
 )
-from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, DiveStatus
+from aquaflow.base.storage.dive_status import (
+    CHECKPOINT,
+    DiveState,
+    DiveStatus,
+    is_cut_off_replay,
+)
 from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.config import Config
@@ -159,7 +164,7 @@ class DiveFolder:
             raise InputError(
                 f"{self.path} holds files that are not a dive; choose an empty folder as --out"
             )
-        if occupied and not overwrite:
+        if occupied and not overwrite and not is_cut_off_replay(self.path):
             raise InputError(
                 f"{self.path} already holds a dive; choose another --out or add --overwrite"
             )

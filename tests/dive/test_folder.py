@@ -15,7 +15,12 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.base.storage.dive_status import DiveState, read_status, unfinished_reason
+from aquaflow.base.storage.dive_status import (
+    DiveState,
+    DiveStatus,
+    read_status,
+    unfinished_reason,
+)
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
@@ -167,11 +172,48 @@ def test_a_number_that_is_not_finite_is_null_and_costs_no_other(tmp_path: Path) 
     assert written == {"psnr": None, "stages": {"a": [1.5, None]}, "n": 3}
 
 
-def test_overwriting_removes_results_and_keeps_what_is_not_a_runs(tmp_path: Path) -> None:
+def finish(folder: DiveFolder) -> None:
+    folder.write_json("metrics.json", {})
+    folder.set_finished()
+
+
+def test_a_replay_that_was_cut_off_or_came_to_nothing_begins_anew_in_its_folder(
+    tmp_path: Path,
+) -> None:
     dive = tmp_path / "dive"
     with opened(dive):
+        (dive / "map.ply").touch()
+    with opened(dive) as folder:
+        assert not (dive / "map.ply").exists()
+        folder.set_finished()  # nothing of it could be mapped
+    with opened(dive) as folder:
+        finish(folder)
+    with pytest.raises(InputError, match="already holds a dive"):
+        DiveFolder(dive, DEFAULT)
+
+
+@pytest.mark.parametrize(
+    "status",
+    [DiveStatus(DiveState.OPEN, boot="1"), DiveStatus(DiveState.RESCALING), None],
+    ids=["live", "rescaling", "unknown"],
+)
+def test_no_other_dive_is_replaced_unasked(tmp_path: Path, status: DiveStatus | None) -> None:
+    with opened(tmp_path / "dive") as folder:
+        dive = folder.path
+    if status is None:
+        (dive / "dive.json").unlink()
+    else:
+        status.write(dive)
+    with pytest.raises(InputError, match="already holds a dive"):
+        DiveFolder(dive, DEFAULT)
+
+
+def test_overwriting_removes_results_and_keeps_what_is_not_a_runs(tmp_path: Path) -> None:
+    dive = tmp_path / "dive"
+    with opened(dive) as folder:
         (dive / "map_1.ply").touch()
         (dive / "my notes.txt").touch()
+        finish(folder)
     with pytest.raises(InputError, match="--overwrite"):
         DiveFolder(dive, DEFAULT)
     with opened(dive, overwrite=True):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -80,4 +83,23 @@ def test_the_machines_limits_are_not_called_mistakes(
 def test_an_interrupt_keeps_its_exit_code_and_says_what_stays(failing: Cli) -> None:
     ran = failing(KeyboardInterrupt())
     assert ran.code == 130
-    assert ran.err == "aquaflow: stopped; what was written so far stays where it is\n"
+    assert ran.err == (
+        "aquaflow: stopped; what was written so far stays where it is, and the same command begins "
+        "anew\n"
+    )
+
+
+def test_an_interrupt_while_the_command_is_loaded_says_nothing() -> None:
+    pressed = (
+        "import os, signal, sys\n"
+        "class Press:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Press())\n"
+        "from aquaflow.__main__ import main\n"
+        "main()\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", pressed], capture_output=True, check=False, timeout=60
+    )
+    assert (ran.returncode, ran.stdout, ran.stderr) == (-signal.SIGINT, b"", b"")

@@ -33,7 +33,7 @@ OUR_MISTAKE = 70
 """EX_SOFTWARE of sysexits.h."""
 INTERRUPTED = 130
 """As a shell reports an end by Ctrl-C."""
-STOPPED = "stopped; what was written so far stays where it is"
+STOPPED = "stopped; what was written so far stays where it is, and the same command begins anew"
 """The last line of a command that Ctrl-C ended."""
 
 

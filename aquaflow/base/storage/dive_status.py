@@ -121,8 +121,18 @@ def _why_cut_off(dive: Path, live: bool) -> str:
         )
     return (
         f"{dive} is not finished: mapping it was cut off, or failed; map its recording again: "
-        f"`aquaflow map RECORDING --out {dive} --overwrite`"
+        f"`aquaflow map RECORDING --out {dive}`"
     )
+
+
+def is_cut_off_replay(dive: Path) -> bool:
+    """True where mapping a recording ended before it had a result, so that nothing is lost if it
+    begins anew: the recording lies elsewhere. The caller holds the folder's lock."""
+    status = read_status(dive)
+    if status is None or status.is_live or any((dive / CHECKPOINT).glob("*.npz")):
+        return False
+    no_result = status.state.is_complete and not (dive / METRICS).is_file()
+    return status.state is DiveState.OPEN or no_result
 
 
 def refuse_unfinished(dive: Path) -> None:
