@@ -139,18 +139,17 @@ class FineTuningSettings:
     """Pairs of a step, on all processes together: the paper's 16 GPUs, 4 batches of 2 on each."""
     seed: int = 0
 
-    @property
-    def batches(self) -> int:
-        """Of a step, on all processes together.
-
-        Raises:
-            InputError: they do not come out even.
-        """
+    def __post_init__(self) -> None:
+        """Raises InputError where a step's batches do not come out even."""
         if self.effective_batch % self.batch:
             raise InputError(
                 f"{self.effective_batch} pairs of a step cannot be cut into batches of "
                 f"{self.batch}; give a --batch that divides --effective-batch"
             )
+
+    @property
+    def batches(self) -> int:
+        """Of a step, on all processes together."""
         return self.effective_batch // self.batch
 
 
@@ -247,8 +246,7 @@ def fine_tune(
     """Train, and write ``mast3r.pth``, which `aquaflow lab prior export mast3r` reads.
 
     Raises:
-        InputError: too few pairs, batches that do not come out even, or ``out`` holds the
-            checkpoint of another network.
+        InputError: too few pairs, or ``out`` holds the checkpoint of another network.
     """
     task = FineTuning(network, pairs, settings, process)
     history = train(task, plan_of(task.batches_per_epoch, settings), out, progress, process)

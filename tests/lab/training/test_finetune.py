@@ -172,7 +172,7 @@ def test_a_step_is_the_same_on_any_number_of_processes(pairs: MinedPairs, count:
 
 def test_batches_that_do_not_come_out_even_are_refused() -> None:
     with pytest.raises(InputError, match="cut into batches of 3; give a --batch"):
-        plan_of(100, FineTuningSettings(batch=3))
+        FineTuningSettings(batch=3)
 
 
 def test_too_few_pairs_are_refused(pairs: MinedPairs) -> None:
