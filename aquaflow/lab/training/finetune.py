@@ -29,7 +29,7 @@ from aquaflow.lab.training.datasets.posed import Frames, Posed, nothing_in, read
 from aquaflow.lab.training.datasets.simulated import mimir, tartanair
 from aquaflow.lab.training.datasets.uwstereo import uwstereo
 from aquaflow.lab.training.losses import Losses, LossWeights, pair_loss
-from aquaflow.lab.training.mining import MinedPairs, load_index, mine, save_index
+from aquaflow.lab.training.mining import MinedPairs, PairIndex, load_index, mine, save_index
 from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.scene import rotation
 from aquaflow.lab.training.pair_generator.stored_pairs import STRIDE
@@ -117,10 +117,11 @@ READERS: dict[str, Callable[[Path], list[Frames]]] = {
 
 INDEX, WEIGHTS = "pairs.jsonl", "mast3r.pth"
 """Files of a run: the pairs that were found, the weights of the network."""
-HELD_OUT_EVERY = 50
-"""Of so many pairs one is never trained on."""
+STRETCH, HELD_OUT_EVERY = 60, 50
+"""Of so many stretches of so many pictures, one is never trained on. It is longer than the gap
+between a pair's pictures: neighbouring pairs show the same."""
 HELD_OUT = 64
-"""Of them at most are looked at; more only take longer."""
+"""Of its pairs at most are looked at; more only take longer."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,11 @@ class PairSource(Protocol):
     """Pairs by number."""
 
     @property
+    def index(self) -> Sequence[PairIndex]:
+        """Which pictures make each pair."""
+        ...
+
+    @property
     def kinds(self) -> Sequence[str]:
         """Data set of each pair."""
         ...
@@ -183,13 +189,15 @@ class FineTuning:
         """Raises InputError where there are too few pairs for one batch."""
         self.network = network.to(process.device)
         self._pairs, self._settings, self._process = pairs, settings, process
-        numbers = range(len(pairs.kinds))
-        held_out = [n for n in numbers if n % HELD_OUT_EVERY == HELD_OUT_EVERY - 1]
-        self._held_out = held_out[:HELD_OUT]
+        held_out: list[int] = []
         by_kind: dict[str, list[int]] = {}
-        for number in numbers:
-            if number % HELD_OUT_EVERY != HELD_OUT_EVERY - 1:
-                by_kind.setdefault(pairs.kinds[number], []).append(number)
+        for number, (pair, kind) in enumerate(zip(pairs.index, pairs.kinds, strict=True)):
+            unseen = [is_held_out(pair.sequence, picture) for picture in (pair.a, pair.b)]
+            if all(unseen):
+                held_out.append(number)
+            elif not any(unseen):
+                by_kind.setdefault(kind, []).append(number)
+        self._held_out = held_out[:: len(held_out) // HELD_OUT + 1]
         self._order = BalancedOrder(by_kind, settings.seed)
         if self._order.length < settings.batch:
             raise InputError(
@@ -233,6 +241,11 @@ class FineTuning:
         epoch, place = divmod(batch, self.batches_per_epoch)
         first = place * self._settings.batch
         return self._order.epoch(epoch)[first : first + self._settings.batch]
+
+
+def is_held_out(scene: int, picture: int) -> bool:
+    """Whether the picture of that number in that scene is never trained on."""
+    return (scene + picture // STRETCH) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 
 
 def fine_tune(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from aquaflow.lab.networks.mast3r.network import TINY, Mast3r, Mast3rSize
 from aquaflow.lab.training.finetune import WEIGHTS, FineTuning, FineTuningSettings
+from aquaflow.lab.training.mining import PairIndex
 from aquaflow.lab.training.pair_generator.drawing import through_water, turned_view
 from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.scene import Detail
@@ -49,6 +50,10 @@ class GeneratedPairs:
 
     pool: Pool
     count: int
+
+    @property
+    def index(self) -> list[PairIndex]:
+        return [PairIndex(number, 0, 1, 1.0) for number in range(self.count)]
 
     @property
     def kinds(self) -> list[str]:

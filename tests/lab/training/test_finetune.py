@@ -25,7 +25,9 @@ from aquaflow.lab.networks.mast3r import export as weights
 from aquaflow.lab.networks.mast3r.network import TINY, Mast3r
 from aquaflow.lab.training import finetune
 from aquaflow.lab.training import trainer as processes
+from aquaflow.lab.training.datasets.posed import Frames
 from aquaflow.lab.training.finetune import (
+    HELD_OUT,
     BalancedOrder,
     FineTuning,
     FineTuningSettings,
@@ -37,7 +39,7 @@ from aquaflow.lab.training.finetune import (
     recolour,
     vary,
 )
-from aquaflow.lab.training.mining import MinedPairs
+from aquaflow.lab.training.mining import MinedPairs, PairIndex
 from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pairs import Pair, correspondences, nearest_pixels, true_pointmaps
 from aquaflow.lab.training.trainer import (
@@ -115,6 +117,24 @@ def test_an_epoch_shows_every_pair_once_in_an_order_of_its_own(pairs: MinedPairs
     again = [n for batch in range(task.batches_per_epoch) for n in
              task.numbers(task.batches_per_epoch + batch)]  # fmt: skip
     assert again != epoch
+
+
+def test_no_picture_of_a_held_out_pair_is_trained_on() -> None:
+    """One scene of 4,000 pictures, and 200 of two pictures each."""
+    index = [PairIndex(0, a, a + gap, 0.5) for a in range(3_945) for gap in (1, 8, 55)]
+    index += [PairIndex(scene, 0, 1, 0.5) for scene in range(1, 201)]
+    scenes = [Frames(str(n), (), "tartanair" if n == 0 else "uwstereo") for n in range(201)]
+    task = FineTuning(tiny(), MinedPairs(scenes, index, 32, 32), SMALL, TrainingProcess())
+
+    def pictures(numbers: Iterable[int]) -> set[tuple[int, int]]:
+        found = [index[n] for n in numbers]
+        return {(pair.sequence, picture) for pair in found for picture in (pair.a, pair.b)}
+
+    trained = [n for kind in task._order._by_kind.values() for n in kind]
+    assert HELD_OUT / 2 < len(task._held_out) <= HELD_OUT
+    assert {scenes[index[n].sequence].kind for n in task._held_out} == {"tartanair", "uwstereo"}
+    assert not pictures(trained) & pictures(task._held_out)
+    assert len(trained) > 0.95 * len(index)
 
 
 def test_an_epoch_takes_from_each_data_set_as_the_paper_does() -> None:
