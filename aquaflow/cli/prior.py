@@ -150,8 +150,10 @@ def train_mast3r(
     width: Annotated[int, typer.Option(help="px of the pictures, a multiple of 16.")] = 512,
     height: Annotated[int, typer.Option(help="px, a multiple of 16.")] = 384,
     epochs: Annotated[int, typer.Option(min=1, help="The first 2 of 15 are warm-up.")] = 30,
-    batch: Annotated[int, typer.Option(min=1, help="Pairs of a batch, on each GPU.")] = 2,
-    accumulate: Annotated[int, typer.Option(min=1, help="Batches of a step.")] = 4,
+    batch: Annotated[int, typer.Option(min=1, help="Pairs at once, on each GPU.")] = 2,
+    effective_batch: Annotated[
+        int, typer.Option(min=1, help="Pairs of a step, on all GPUs together.")
+    ] = 128,
     seed: Annotated[int, typer.Option(help="Of order and draws.")] = 0,
 ) -> None:
     """Fine-tune as in the paper; resumes from --out.
@@ -163,7 +165,7 @@ def train_mast3r(
     from aquaflow.lab.training.trainer import joined_processes
 
     settings = finetune.FineTuningSettings(
-        width, height, epochs, max(1, epochs * 2 // 15), batch, accumulate, seed
+        width, height, epochs, max(1, epochs * 2 // 15), batch, effective_batch, seed
     )
     sequences = finetune.read_data(data)
     with joined_processes() as process, progress_bars(quiet=not process.leads) as advance:

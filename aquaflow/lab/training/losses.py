@@ -1,7 +1,8 @@
 """L_total = L_conf + beta L_match (paper, Eq. 2): where the points are, and which pixels match.
 
 Both terms let the network predict its confidence: an error counts by its confidence, and the
-logarithm of the confidence is rewarded.
+logarithm of the confidence is rewarded. Definitions and weights that the paper leaves out are those
+that MASt3R's authors publish for their training.
 """
 
 from __future__ import annotations
@@ -91,17 +92,16 @@ def points_loss(
 def match_loss(
     pair: Pair, a: Geometry, b: Geometry, weights: LossWeights, generator: torch.Generator
 ) -> Tensor:
-    """L_match: InfoNCE both ways over true correspondences, weighted by the descriptors' trust."""
-    found = correspondences(pair)
-    rows, columns = nearest_pixels(found.pixels, pair.b)
+    """L_match: InfoNCE both ways over true matches, weighted by the mean of both confidences."""
+    reciprocal, rows, columns = reciprocal_matches(pair)
     losses = []
     for item in range(len(rows)):
-        places = _draw(found.visible[item], weights.matches, generator)
+        places = _draw(reciprocal[item], weights.matches, generator)
         if len(places) < 2:  # nothing to distinguish
             continue
         v, u = places.unbind(1)
         v_b, u_b = rows[item, v, u], columns[item, v, u]
-        trust = (a.C[item, v, u] * b.C[item, v_b, u_b]).sqrt()
+        trust = (a.C[item, v, u] + b.C[item, v_b, u_b]) / 2
         losses.append(
             info_nce(
                 a.D[item, v, u],
@@ -114,6 +114,23 @@ def match_loss(
     return torch.stack(losses).mean() if losses else a.D.sum() * 0.0
 
 
+def reciprocal_matches(pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
+    """[B, H, W] bool, row and column: a's pixels whose match in b has them for its own match.
+
+    No pixel of b is then the match of two of a, which would be each other's negatives.
+    """
+    there, back = correspondences(pair), correspondences(pair.swap())
+    rows, columns = nearest_pixels(there.pixels, pair.b)
+    rows_back, columns_back = nearest_pixels(back.pixels, pair.a)
+    batch, v, u = (
+        torch.arange(n, device=rows.device).view([-1 if i == axis else 1 for i in range(3)])
+        for axis, n in enumerate(rows.shape)
+    )
+    at = (batch, rows, columns)
+    same = (rows_back[at] == v) & (columns_back[at] == u) & back.visible[at]
+    return there.visible & same, rows, columns
+
+
 def info_nce(
     D_a: Tensor,  # [M, d] unit descriptors
     D_b: Tensor,  # [M, d] of the matches, in the same order
@@ -121,11 +138,12 @@ def info_nce(
     temperature: float,
     alpha: float,
 ) -> Tensor:
-    """Mean of trust * cross-entropy - alpha log trust: each must find its match among all."""
+    """Mean of trust * (cross-entropies of both ways) - alpha log trust: each must find its match
+    among all."""
     scores = D_a @ D_b.mT / temperature
     own = torch.arange(len(scores), device=scores.device)
     both = [F.cross_entropy(s, own, reduction="none") for s in (scores, scores.mT)]
-    return (trust * (both[0] + both[1]) / 2 - alpha * trust.log()).mean()
+    return (trust * (both[0] + both[1]) - alpha * trust.log()).mean()
 
 
 def _draw(

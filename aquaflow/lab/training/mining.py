@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -111,28 +112,32 @@ class MinedPairs:
     def __len__(self) -> int:
         return len(self.index)
 
-    def pair(self, numbers: Sequence[int]) -> Pair:
+    @cached_property
+    def kinds(self) -> list[str]:
+        """Data set of each pair."""
+        return [self.scenes[pair.sequence].kind for pair in self.index]
+
+    def pair(
+        self,
+        numbers: Sequence[int],
+        zooms: Tensor | None = None,  # [B, 2] of either view, at least 1; None: 1
+    ) -> Pair:
         """A batch; the first view of each pair is at the origin, and nothing that moved is valid.
 
         Poses go in as float64 and out as float32 only after the world's far origin was left.
         """
-        pairs = [self._one(self.index[number]) for number in numbers]
+        factors = [(1.0, 1.0)] * len(numbers) if zooms is None else zooms.tolist()
+        rows = zip(numbers, factors, strict=True)
+        pairs = [self._one(self.index[number], *zoom) for number, zoom in rows]
         return Pair(_batch([pair.a for pair in pairs]), _batch([pair.b for pair in pairs]))
 
-    def _one(self, index: PairIndex) -> Pair:
+    def _one(self, index: PairIndex, zoom_a: float, zoom_b: float) -> Pair:
         scene = self.scenes[index.sequence]
         first, second = scene[index.a], scene[index.b]
         T_aw = np.linalg.inv(first.T_wc)
-        a = self._view(first, T_aw)
-        b = self._view(second, T_aw)
+        a = view_of(first, self.width, self.height, T_aw, zoom_a)
+        b = view_of(second, self.width, self.height, T_aw, zoom_b)
         return Pair(_without(a, is_moved(a, b)), _without(b, is_moved(b, a)))
-
-    def _view(
-        self,
-        posed: Posed,
-        T_rw: npt.NDArray[np.floating],  # [4, 4] world to reference
-    ) -> ViewBatch:
-        return view_of(posed, self.width, self.height, T_rw)
 
 
 def save_index(pairs: Sequence[PairIndex], path: Path) -> None:
@@ -175,13 +180,15 @@ def view_of(
     width: int,
     height: int,
     T_rw: npt.NDArray[np.floating] | None = None,  # [4, 4] world to reference
+    zoom: float = 1.0,
 ) -> ViewBatch:
-    """[1, ...] the picture's middle, as large as fits; poses are of the camera to ``r``.
+    """[1, ...] the picture's middle, as large as fits, seen ``zoom`` times as large; poses are of
+    the camera to ``r``.
 
     Depth is never averaged: between near and far there is nothing.
     """
     old_height, old_width = posed.depth.shape
-    scale = max(width / old_width, height / old_height)
+    scale = zoom * max(width / old_width, height / old_height)
     size = (max(width, round(scale * old_width)), max(height, round(scale * old_height)))
     way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
     left, top = (size[0] - width) // 2, (size[1] - height) // 2

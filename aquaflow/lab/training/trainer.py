@@ -40,8 +40,8 @@ class Task(Protocol):
         """What is trained."""
         ...
 
-    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
-        """Loss of the batch that ``step`` stands for, and the terms it is made of."""
+    def loss(self, batch: int) -> tuple[Tensor, dict[str, float]]:
+        """Loss of batch number ``batch``, and the terms it is made of."""
         ...
 
     def validate(self) -> dict[str, float]:
@@ -54,8 +54,8 @@ class TrainingPlan:
     """How long and how carefully."""
 
     schedule: Schedule
-    accumulate: int = 1
-    """Batches whose gradients make one step."""
+    batches: int = 1
+    """Of a step, shared out among the processes: the step is the same however many there are."""
     weight_decay: float = 0.01
     betas: tuple[float, float] = (0.9, 0.95)
     longest_gradient: float = 1.0
@@ -86,7 +86,7 @@ def train(
 ) -> list[dict[str, float]]:
     """Train until the schedule or the plan's hours end, from ``out``'s checkpoint if there is one.
 
-    Gradients are averaged over all processes, and the one that leads writes files.
+    Gradients are summed over all processes, and the one that leads writes files.
 
     Returns:
         One row per validation: step, cpu_s, rate, the mean training terms and the figures.
@@ -143,12 +143,13 @@ def _step(
         group["lr"] = plan.schedule.rate(step)
     optimiser.zero_grad(set_to_none=True)
     means: dict[str, float] = {}
-    for part in range(plan.accumulate):
-        loss, terms = task.loss(step * plan.accumulate + part)
-        (loss / plan.accumulate).backward()  # type: ignore[no-untyped-call]
+    parts = range(process.rank, plan.batches, process.count)
+    for part in parts:
+        loss, terms = task.loss(step * plan.batches + part)
+        (loss / plan.batches).backward()  # type: ignore[no-untyped-call]
         for name, value in terms.items():
-            means[name] = means.get(name, 0.0) + value / plan.accumulate
-    process.average(task.network.parameters())
+            means[name] = means.get(name, 0.0) + value / len(parts)
+    process.add_up(task.network.parameters())
     norm = nn.utils.clip_grad_norm_(task.network.parameters(), plan.longest_gradient)
     if bool(torch.isfinite(norm)):
         optimiser.step()
@@ -254,10 +255,10 @@ class Schedule:
 
 
 # --------------------------------------------------------------------------------------------------
-# Several processes that train one network, each on batches of its own (torchrun).
+# Several processes that train one network, each on its share of a step's batches (torchrun).
 #
-# Gradients are averaged once a step, after all batches of the step were summed up: the exchange
-# then costs the same however many batches a step has.
+# Gradients are exchanged once a step, after each process has summed up those of its batches: this
+# costs the same however many batches a step has.
 
 
 class TrainingProcess:
@@ -272,11 +273,11 @@ class TrainingProcess:
         """True for the one process that writes files."""
         return self.rank == 0
 
-    def average(
+    def add_up(
         self,
         parameters: Iterable[Tensor],  # [...] each
     ) -> None:
-        """Replace every gradient by its mean over the processes."""
+        """Replace every gradient by its sum over the processes."""
 
     def wait(self) -> None:
         """Wait until every process is here."""
@@ -290,7 +291,7 @@ class DistributedProcess(TrainingProcess):
         if torch.cuda.is_available():
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
 
-    def average(
+    def add_up(
         self,
         parameters: Iterable[Tensor],  # [...] each
     ) -> None:
@@ -301,7 +302,6 @@ class DistributedProcess(TrainingProcess):
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
             dist.all_reduce(parameter.grad)
-            parameter.grad /= self.count
 
     def wait(self) -> None:
         """Wait until every process is here."""

@@ -11,8 +11,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.lab.training.losses import LossWeights, info_nce, match_loss, pair_loss, points_loss
-from aquaflow.lab.training.pairs import Pair, true_pointmaps
+from aquaflow.lab.training.losses import (
+    LossWeights,
+    info_nce,
+    match_loss,
+    pair_loss,
+    points_loss,
+    reciprocal_matches,
+)
+from aquaflow.lab.training.pairs import Pair, correspondences, true_pointmaps
 from aquaflow.lab.training.trainer import Schedule
 from tests.lab.training.plane_pairs import shifted_pair
 
@@ -81,7 +88,7 @@ def test_gradients_of_the_points_term_are_exact() -> None:
 def test_info_nce_is_chance_for_equal_descriptors_and_nothing_for_clear_ones() -> None:
     trust = torch.ones(8)
     same = F.normalize(torch.ones(8, 8), dim=-1)
-    assert float(info_nce(same, same, trust, 0.05, 10.0)) == pytest.approx(math.log(8))
+    assert float(info_nce(same, same, trust, 0.05, 10.0)) == pytest.approx(2 * math.log(8))
     assert float(info_nce(torch.eye(8), torch.eye(8), trust, 0.05, 10.0)) < 1e-6
 
 
@@ -91,6 +98,32 @@ def test_gradients_of_info_nce_are_exact() -> None:
     trust = (torch.rand(5, generator=rng, dtype=torch.float64) + 0.5).requires_grad_()
     inputs = (D_a.requires_grad_(), D_b.requires_grad_(), trust)
     torch.autograd.gradcheck(lambda *x: info_nce(*x, temperature=0.5, alpha=10.0), inputs)
+
+
+def test_a_match_counts_by_the_mean_of_both_confidences() -> None:
+    """As published; the product would let one view alone call a match worthless."""
+    pair = shifted_pair(0.5)
+    a, b = said(pair)
+    sure, unsure = torch.full_like(a.C, 3.0), torch.full_like(a.C, 1.0)
+    weights = replace(LossWeights(), match_alpha=0.0)
+    plain = match_loss(pair, a._replace(C=unsure), b._replace(C=unsure), weights, generator())
+    mixed = match_loss(pair, a._replace(C=sure), b._replace(C=unsure), weights, generator())
+    assert float(mixed) == pytest.approx(2.0 * float(plain))
+    rewarded = replace(weights, match_alpha=10.0)
+    loss = match_loss(pair, a._replace(C=sure), b._replace(C=unsure), rewarded, generator())
+    assert float(loss) == pytest.approx(float(mixed) - 10.0 * math.log(2.0))
+
+
+def test_a_pixel_is_the_match_of_one_pixel() -> None:
+    """The second view is thrice as far away: nine pixels of the first fall into one of it."""
+    pair = shifted_pair(0.0)
+    T_wc = pair.b.T_wc.clone()
+    T_wc[:, 2, 3] = -4.0
+    pair = Pair(pair.a, replace(pair.b, T_wc=T_wc, depth=3.0 * pair.b.depth))
+    assert int(correspondences(pair).visible.sum()) > 36
+    reciprocal, rows, columns = reciprocal_matches(pair)
+    taken = torch.stack([rows[reciprocal], columns[reciprocal]], 1)
+    assert len(taken) == len(taken.unique(dim=0)) == 36
 
 
 def test_descriptors_of_the_scene_itself_beat_random_ones() -> None:

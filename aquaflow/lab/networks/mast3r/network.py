@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -192,11 +193,16 @@ class Mast3r(nn.Module):
             layers_a.append(x)
             layers_b.append(y)
         layers_a[-1], layers_b[-1] = self.dec_norm(x), self.dec_norm(y)
-        read_a, read_b = ([layers[i] for i in self.size.hooks] for layers in (layers_a, layers_b))
-        return (
-            self.downstream_head1(read_a, rows, columns),
-            self.downstream_head2(read_b, rows, columns),
+        # Points are exponentials of what the heads say: they are computed in 32 bits, as in the
+        # published network, whatever precision the blocks run in.
+        read_a, read_b = (
+            [layers[i].float() for i in self.size.hooks] for layers in (layers_a, layers_b)
         )
+        with _without_autocast(a.device):
+            return (
+                self.downstream_head1(read_a, rows, columns),
+                self.downstream_head2(read_b, rows, columns),
+            )
 
     def forward(
         self,
@@ -211,6 +217,13 @@ class Mast3r(nn.Module):
         table = rotary_table(rows, columns, head_width, self.size.rotary_base)
         device = self.mask_token.device
         return RotaryTable(table.cosine.to(device), table.sine.to(device))
+
+
+def _without_autocast(device: torch.device) -> AbstractContextManager[object]:
+    """32 bits; there is nothing to leave on a device without autocast, such as meta."""
+    if not torch.amp.is_autocast_available(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -45,6 +45,11 @@ class Sequence(Protocol):
         """Name for messages and figures."""
         ...
 
+    @property
+    def kind(self) -> str:
+        """Data set that it is of."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Posed: ...
@@ -56,6 +61,7 @@ class Frames:
 
     name: str
     readers: tuple[Callable[[], Posed], ...]
+    kind: str = ""
 
     def __len__(self) -> int:
         return len(self.readers)

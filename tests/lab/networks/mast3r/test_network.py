@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from aquaflow.lab.networks.mast3r.network import (
@@ -93,6 +94,32 @@ def test_wild_activations_stay_finite() -> None:
             head.head_local_features.fc2.weight.mul_(1e6)  # type: ignore[operator,union-attr]
     for view in network(pictures(2, 2), pictures(2, 2, seed=1)):
         assert all(bool(torch.isfinite(value).all()) for value in view)
+
+
+def test_heads_compute_in_32_bits_under_autocast() -> None:
+    """As in the published network: 16-bit heads put points ten times further off."""
+    network, images = tiny(), pictures(3, 4, 2)
+    kinds: dict[bool, set[torch.dtype]] = {True: set(), False: set()}
+
+    def note(name: str) -> Callable[[nn.Module, object, object], None]:
+        def hook(module: nn.Module, given: object, found: object) -> None:
+            if isinstance(found, Tensor) and isinstance(module, nn.Linear | nn.Conv2d):
+                kinds[name.startswith("downstream_head")].add(found.dtype)
+
+        return hook
+
+    for name, module in network.named_modules():
+        module.register_forward_hook(note(name))
+    with torch.no_grad():
+        exact = network(images, images.flip(3))
+        kinds[True].clear()
+        kinds[False].clear()
+        with torch.autocast("cpu", torch.bfloat16):
+            found = network(images, images.flip(3))
+    assert kinds == {True: {torch.float32}, False: {torch.bfloat16}}
+    for view, other in zip(exact, found, strict=True):
+        off = (view.X - other.X).norm(dim=-1) / view.X.norm(dim=-1)
+        assert float(off.median()) < 1e-3  # 3e-3 to 5e-3 with heads in 16 bits
 
 
 def test_a_cached_encoding_decodes_as_the_pair_does() -> None:
