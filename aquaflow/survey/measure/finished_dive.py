@@ -69,7 +69,7 @@ def _draw(
 ) -> tuple[HeightField, Ground]:
     from aquaflow.survey.measure.drawn_heights import draw_heights  # loads torch
 
-    ground = ground_of(dive.frame, mapper.views)
+    ground = ground_of(dive.frame, mapper)
     return draw_heights(mapper, ground, work, cell, progress), ground
 
 
