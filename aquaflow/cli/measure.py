@@ -341,4 +341,4 @@ def level(
         said = {"sigma_deg": found.sigma_deg, "source": report.source, "used": report.used}
         typer.echo(json.dumps(said))
         return
-    typer.echo(f"The vertical is known to {found.sigma_deg:.2g} degrees (1 sigma).\n{LEVELLED}")
+    typer.echo(f"{found.in_words()}\n{LEVELLED}")

@@ -19,14 +19,13 @@ from aquaflow.survey.export.ortho.ground import NO_OVERVIEW, OVERVIEW
 from aquaflow.survey.measure.asked import Asked
 from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.survey.measure.reframing import (
-    GRAVITY,
     Progress,
     level,
     measure_anew,
     reframe,
     why_not_level,
 )
-from aquaflow.telemetry.world_frame import LARGEST_TILT_SIGMA, SourceReport
+from aquaflow.telemetry.world_frame import GRAVITY, LARGEST_TILT_SIGMA, SourceReport
 
 Array = npt.NDArray[np.float64]
 
@@ -56,6 +55,10 @@ class Vertical:
     def sigma_deg(self) -> float:
         """1 sigma in the direction that is known least."""
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
+
+    def in_words(self) -> str:
+        """How well it is known."""
+        return f"The vertical is known to {self.sigma_deg:.2g} degrees (1 sigma)."
 
 
 def of_points(dive: Dive, asked: list[Asked], sigma_deg: float = LEVEL_SIGMA_DEG) -> Vertical:

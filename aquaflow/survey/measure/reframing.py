@@ -45,15 +45,16 @@ from aquaflow.survey.measure.notes import moved_notes, read_notes, write_notes
 from aquaflow.survey.measure.reef_numbers import CSV, JSON, write_reef_numbers
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.world_frame import LARGEST_SCALE_SIGMA, SourceReport, WorldFrame
+from aquaflow.telemetry.world_frame import (
+    LARGEST_SCALE_SIGMA,
+    LENGTH,
+    MARKED,
+    SourceReport,
+    WorldFrame,
+)
 from aquaflow.water.mounting import Lamp
 
 Array = npt.NDArray[np.float64]
-
-MARKED = "marked by hand"
-"""Reason in the report of what this module used: it may be replaced by something better."""
-LENGTH, GRAVITY = "length", "gravity"
-"""Kinds of it."""
 
 
 def why_not_metric(frame: WorldFrame | None, scale: LengthScale) -> str | None:
@@ -62,7 +63,7 @@ def why_not_metric(frame: WorldFrame | None, scale: LengthScale) -> str | None:
         return "The dive has no metric.json that names this sub-map; its files keep their unit."
     if scale.relative_sigma > LARGEST_SCALE_SIGMA:
         return f"A scale to {100.0 * scale.relative_sigma:.0f} % is too uncertain for metres."
-    if frame.metric and not _is_marked(frame, LENGTH):
+    if frame.metric and not frame.is_marked(LENGTH):
         apart = 100.0 * (scale.metres_per_unit / frame.T_nm.scale - 1.0)
         return (
             f"The dive's files keep the metres of {frame.scale_source}; the marked lengths say "
@@ -77,14 +78,10 @@ def why_not_level(frame: WorldFrame | None) -> str | None:
         return "the dive has no metric.json that names its largest sub-map; map it again"
     if frame.site:
         return f"the dive lies in the frame of {frame.site}; make that dive level, and map this one"
-    if frame.level and not _is_marked(frame, GRAVITY):
+    if frame.gravity_measured:
         sigma = np.degrees(frame.tilt_sigma_rad)
         return f"the dive's telemetry has measured gravity, to {sigma:.2g} degrees; it is level"
     return None
-
-
-def _is_marked(frame: WorldFrame, kind: str) -> bool:
-    return any(source.reason == MARKED and source.kind == kind for source in frame.sources)
 
 
 def metric(frame: WorldFrame, lengths: Sequence[KnownLength], scale: LengthScale) -> WorldFrame:

@@ -19,11 +19,11 @@ from aquaflow.dive.tum import read_tum
 from aquaflow.survey.measure.levelling import Vertical, make_level, of_pitch, plane_of
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
 from aquaflow.survey.measure.points import MeasuredPoints
-from aquaflow.survey.measure.reframing import GRAVITY, level, metric, reframe
+from aquaflow.survey.measure.reframing import level, metric, reframe
 from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, scale_of
 from aquaflow.telemetry.metric_file import read_metric_file, write_metric_file
-from aquaflow.telemetry.world_frame import SourceReport, WorldFrame
+from aquaflow.telemetry.world_frame import GRAVITY, SourceReport, WorldFrame
 from tests.command_line import Cli, refused
 
 PITCH_DEG = 41.9
