@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError, reason_of
-from aquaflow.base.errors.regular_file import open_regular_text
+from aquaflow.base.errors import InputError
 from aquaflow.base.storage.archive import read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.base.storage.dive_status import rescaling
@@ -36,8 +35,8 @@ from aquaflow.dive.metric_outputs import (
 from aquaflow.dive.placement import GEOREFERENCE, georeference
 from aquaflow.dive.ply import read_ply, write_ply
 from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
-from aquaflow.dive.tum import write_tum
-from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.dive.tum import Trajectory, write_tum
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.coverage.coverage_files import write_coverage
@@ -146,16 +145,8 @@ def reframe(dive: Dive, sub_map: int, after: WorldFrame) -> None:
     # All is read before anything is written: a damaged file changes none.
     plys = [dive.file(f"{name}{suffix}.ply") for name in ("map", "map_clear")]
     splats = {path: read_ply(path) for path in plys if path.is_file()}
-    rows, poses = dive.poses, _poses(dive.file(TRAJECTORY))
-    inside = {round(1e9 * row.t_s) for row in rows if row.sub_map == sub_map}
-    chosen = np.array([round(1e9 * t) in inside for t in poses[:, 0]], bool)
-    places: dict[int, Sim3] = {}
-    for pose in poses[chosen]:
-        T_nc = change @ Sim3(rotation_from_quaternion(pose[[7, 4, 5, 6]]), pose[1:4])
-        places[round(1e9 * pose[0])] = Sim3(T_nc.R, T_nc.t)
-    moved = list(places.values())
-    poses[chosen, 1:4] = np.array([T.t for T in moved]).reshape(-1, 3)
-    poses[chosen, 4:] = np.array([T.quaternion[[1, 2, 3, 0]] for T in moved]).reshape(-1, 4)
+    path, places = _moved(dive, sub_map, change)
+    table = _rows(dive.poses, sub_map, after, places)
     seen = read_coverage_file(dive.file(COVERAGE)) if dive.has(COVERAGE) else {}
     texts, notes = {}, []
     if sub_map == main:
@@ -168,13 +159,10 @@ def reframe(dive: Dive, sub_map: int, after: WorldFrame) -> None:
     if placed is not None:
         texts[GEOREFERENCE] = placed
     with rescaling(folder):
-        for path, each in splats.items():
-            write_ply(path, each.transform(change))
-        write_trajectory_csv(folder / trajectory_csv.NAME, _rows(rows, sub_map, after, places))
-        write_tum(
-            folder / TRAJECTORY, poses[:, 0], poses[:, 1:4], poses[:, [7, 4, 5, 6]],
-            worlds_in_words(frames),
-        )  # fmt: skip
+        for ply, each in splats.items():
+            write_ply(ply, each.transform(change))
+        write_trajectory_csv(folder / trajectory_csv.NAME, table)
+        write_tum(folder / TRAJECTORY, path.t_s, path.positions, path.wxyz, worlds_in_words(frames))
         for name, content in texts.items():
             write_json(folder / name, content)
         if sub_map == main:
@@ -185,6 +173,27 @@ def reframe(dive: Dive, sub_map: int, after: WorldFrame) -> None:
             seen[sub_map] = seen[sub_map].rescale(times, after.unit)
             write_coverage(folder, seen, main)
         write_metric_file(folder, frames, main)
+
+
+def _moved(dive: Dive, sub_map: int, change: Sim3) -> tuple[Trajectory, dict[int, Sim3]]:
+    """The dive's path after ``change`` of a sub-map, and that sub-map's T_nc by time, ns.
+
+    Raises:
+        InputError: trajectory.tum cannot be read, or lacks a pose of trajectory.csv.
+    """
+    path = dive.trajectory
+    inside = {round(1e9 * row.t_s) for row in dive.poses if row.sub_map == sub_map}
+    positions, wxyz, found = path.positions.copy(), path.wxyz.copy(), {}
+    for number, (t_s, R) in enumerate(zip(path.t_s, path.R_wc, strict=True)):
+        if round(1e9 * t_s) in inside:
+            T = change @ Sim3(R, positions[number])
+            found[round(1e9 * t_s)] = Sim3(T.R, T.t)
+            positions[number], wxyz[number] = T.t, T.quaternion
+    if inside - found.keys():
+        raise InputError(
+            f"{dive.file(TRAJECTORY)} lacks poses of {trajectory_csv.NAME}; map the dive again"
+        )
+    return Trajectory(path.t_s, positions, wxyz), found
 
 
 def _rows(
@@ -237,15 +246,6 @@ def _scale_ranges(folder: Path, times: float) -> None:
         z = read_arrays_of(path, folders=1, most_bytes=MOST_RANGE_BYTES)["z"]
         with atomic_write(path) as stream:
             np.savez_compressed(stream, z=(times * z.astype(np.float64)).astype(np.float32))
-
-
-def _poses(path: Path) -> Array:
-    """[N, 8] of trajectory.tum."""
-    try:
-        with open_regular_text(path) as stream:
-            return np.loadtxt(stream, np.float64, ndmin=2).reshape(-1, 8)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
 
 
 # --------------------------------------------------------------------------------------------------
