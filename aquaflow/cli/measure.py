@@ -1,4 +1,5 @@
-"""The commands that measure in a dive: ``measure``, ``measure scale``. Thin, as all of cli/."""
+"""The commands that measure in a dive: ``measure``, ``measure scale``, ``measure level``. Thin, as
+all of cli/."""
 
 from __future__ import annotations
 
@@ -42,6 +43,7 @@ def measure_group() -> typer.Typer:
     group = typer.Typer(cls=GroupWithDefault)
     group.command("measure")(measure)
     group.command()(scale)
+    group.command()(level)
     return group
 
 
@@ -176,22 +178,17 @@ def _in_words(found: Any, unit: LengthUnit) -> str:
             )
     else:
         named = [(each.label, each.quantity) for each in found.numbers]
-        said = [f"{what}: unknown, {why}." for what, why in found.missing.items()]
+        said = [f"{what.replace('_', ' ')}: unknown, {why}." for what, why in found.missing.items()]
         if found.cell is not None:
             cell = read(found.cell, found.unit)
             said.append(
                 f"On cells of {cell.value:.4g} {cell.unit}; vertical is {found.vertical}. Other "
                 "cells have other numbers: compare dives on the same --cell."
             )
-        if found.unit != "m":
-            said.append(
-                "The dive has no metres: lengths are in map units; `aquaflow measure scale` gives "
-                "it some."
-            )
     named = [(name, as_read(q, unit)) for name, q in named]
     width = max((len(name) for name, _ in named), default=0)
     lines = [
-        f"{name:<{width}}  {q.in_words()}  (95 %: {q.low:.4g} to {q.high:.4g})" for name, q in named
+        f"{name:<{width}}  {q.in_words()}  (95 %: {q.interval_in_words()})" for name, q in named
     ]
     return "\n".join([*lines, *said])
 
@@ -279,3 +276,69 @@ def _numbers(option: str, text: str) -> tuple[float, ...]:
     if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
         raise typer.BadParameter(f"{option} {text!r} is neither x,y nor x,y,z; give numbers")
     return numbers
+
+
+# --------------------------------------------------------------------------------------------------
+# The command that gives a finished dive its vertical: ``measure level``.
+
+LEVELLED = (
+    "z points down now, and x along the initial heading, in trajectory.tum, trajectory.csv, "
+    "map.ply, map_clear.ply, metrics.json, metric.json and the notes; overview.png was drawn and "
+    "reef_numbers.* measured anew. report.html is still the old one; `aquaflow export report` "
+    "makes it."
+)
+STEEPEST_DEG = 135.0
+"""Below the horizon: a camera that looks down, and back."""
+
+
+def level(
+    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="On something level, such as the water surface or a tank's floor: x,y,z of the "
+            "map or FRAME:u,v of a picture; three times at least."
+        ),
+    ] = None,
+    camera_pitch: Annotated[
+        float | None,
+        typer.Option(help="Degrees that the cameras look below the horizon, mean; 90: down."),
+    ] = None,
+    sigma: Annotated[
+        float | None,
+        typer.Option(help="Degrees, 1 sigma of the pitch, or of how level it is; else 2."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say which way is down in a dive, so that it has a map from above, relief and slopes."""
+    if (camera_pitch is None) == (not point):
+        raise typer.BadParameter("give --point three times at least, or --camera-pitch")
+    if camera_pitch is not None and not -STEEPEST_DEG <= camera_pitch <= STEEPEST_DEG:
+        raise typer.BadParameter(f"--camera-pitch must lie within \u00b1{STEEPEST_DEG:g} degrees")
+    if sigma is not None and not (math.isfinite(sigma) and sigma > 0.0):
+        raise typer.BadParameter("--sigma must be a positive number of degrees")
+    from aquaflow.survey.measure.asked import parse_point
+    from aquaflow.survey.measure.levelling import (
+        LEVEL_SIGMA_DEG,
+        Vertical,
+        make_level,
+        of_pitch,
+        of_points,
+    )
+
+    asked = [parse_point(text) for text in point or ()]
+    known = LEVEL_SIGMA_DEG if sigma is None else sigma
+
+    def find(read: Dive) -> Vertical:
+        if camera_pitch is not None:
+            return of_pitch(read, camera_pitch, known)
+        return of_points(read, asked, known)
+
+    with progress_bars(quiet=as_json) as bars:
+        found = make_level(dive, find, bars)
+    if as_json:
+        report = found.report
+        said = {"sigma_deg": found.sigma_deg, "source": report.source, "used": report.used}
+        typer.echo(json.dumps(said))
+        return
+    typer.echo(f"{found.in_words()}\n{LEVELLED}")

@@ -179,7 +179,8 @@ def view(
             )
         window = open_site(dive, config, component)
     elif component is None:
-        window = open_dive(dive, config, partial(_mark, dive), white_balance)
+        marks = partial(_mark, dive), white_balance, partial(_turn, dive)
+        window = open_dive(dive, config, *marks)
         if said := note_unfinished(dive):
             typer.echo(f"Warning: {said}.", err=True)
     else:
@@ -205,6 +206,15 @@ def _mark(
 
     marked = keep_length(dive, between_points(Dive(dive), *ends, length_m, sigma_m))
     return f"{marked.in_words()}\n{marked.unchanged or ''}".rstrip(), marked.unchanged is None
+
+
+def _turn(dive: Path, places: list[tuple[float, float, float]]) -> str:
+    """Turn the dive level by points that were marked in the viewer; what came of it."""
+    from aquaflow.survey.measure.asked import MapPoint
+    from aquaflow.survey.measure.levelling import make_level, of_points  # loads torch
+
+    found = make_level(dive, lambda read: of_points(read, [MapPoint(*at) for at in places]))
+    return found.in_words()
 
 
 def _print_status(report: dict[str, Any]) -> None:

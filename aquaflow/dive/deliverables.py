@@ -170,7 +170,9 @@ class Deliverables:
 
         for each in self._others.values():
             if each.phase is phase:
+                each.notes = []
                 self._attempt(each.stage, partial(work, each))
+                self.notes += each.notes
 
     def dive(self, metrics: dict[str, Any]) -> Dive:
         """What is known by now, as who reads the folder later will see it."""
@@ -377,6 +379,8 @@ class Deliverable:
     def __init__(self, slam: Slam) -> None:
         """``slam``: of the dive, before its first frame."""
         self.slam = slam
+        self.notes: list[str] = []
+        """What :meth:`make` left out, and why, for the notes of the dive."""
 
     def look(self) -> None:
         """Take in what is new of the dive; called while the frames of a replay come, after each

@@ -199,7 +199,7 @@ def _rows(
                 x, y, z, frame.unit, latitude, longitude,
                 navigation.depth_m_at(t_ns), navigation.altitude_m_at(t_ns),
                 heading, roll, pitch, speed,
-                position_sigma(frame, T_nc.t), _heading_sigma_deg(frame),
+                position_sigma(frame, T_nc.t), heading_sigma_deg(frame),
             )
         )  # fmt: skip
     return rows
@@ -259,5 +259,6 @@ def position_sigma(
     return float(np.sqrt(np.linalg.eigvalsh(frame.position_covariance(p_n))[-1]))
 
 
-def _heading_sigma_deg(frame: WorldFrame) -> float | None:
+def heading_sigma_deg(frame: WorldFrame) -> float | None:
+    """1 sigma of the heading of n; None while gravity is unknown."""
     return float(np.degrees(frame.heading_sigma_rad)) if frame.level else None

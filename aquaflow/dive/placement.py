@@ -253,6 +253,8 @@ LEVEL = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 FACING = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The same in a map that is not level, whose axes are the first picture's: right, down, ahead."""
+FROM_ABOVE = "from above"
+"""From where a LEVEL page is seen."""
 
 
 def page_axes(
@@ -280,7 +282,7 @@ def names_of(frame: WorldFrame, axes: Array) -> tuple[str, str, str]:  # [2, 3] 
     if axes is FORWARD:
         return "from above the first picture", "right of it", "ahead of it"
     north = frame.north
-    return "from above", "east" if north.endswith("north") else f"right of the {north}", north
+    return FROM_ABOVE, "east" if north.endswith("north") else f"right of the {north}", north
 
 
 # --------------------------------------------------------------------------------------------------

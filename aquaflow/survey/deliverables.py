@@ -6,17 +6,19 @@ What loads torch is imported when a map is there, so that a dive without one nev
 from __future__ import annotations
 
 from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.deliverables import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive
+from aquaflow.survey.export.ortho.ground import NO_OVERVIEW, OVERVIEW
 from aquaflow.survey.measure.finished_dive import numbers_at_the_end
 from aquaflow.survey.measure.reef_numbers import write_reef_numbers
 from aquaflow.survey.report.page import write_report
-from aquaflow.survey.report.report_of import OVERVIEW, report_of
+from aquaflow.survey.report.report_of import report_of
 
 
 class Overview(Deliverable):
-    """overview.png: the map from straight above, for the report."""
+    """overview.png: the map from above, for the report; none where nothing says what is above."""
 
     stage = "drawing the overview"
 
@@ -27,7 +29,11 @@ class Overview(Deliverable):
             return
         from aquaflow.survey.export.ortho.survey import overview_png
 
-        picture = overview_png(mapper, dive.frame)
+        try:
+            picture = overview_png(mapper, dive.frame)
+        except InputError as error:
+            self.notes = [f"{NO_OVERVIEW}: {error}"]
+            return
         with atomic_write(dive.file(OVERVIEW)) as stream:
             stream.write(picture)
 

@@ -31,6 +31,11 @@ UNKNOWN_SIGMA = 1e3
 MAP_UNIT = "the median depth of the first keyframe is 1 map unit"
 """The unit of length of a map whose scale is unknown (see tracking/initialisation)."""
 
+MARKED = "marked by hand"
+"""Reason in the report of what a person marked in a finished dive: something better replaces it."""
+LENGTH, GRAVITY = "length", "gravity"
+"""Kinds of it."""
+
 
 @dataclass(frozen=True)
 class SourceReport:
@@ -108,6 +113,15 @@ class WorldFrame:
         """True if every point of n has a latitude and a longitude."""
         known = self.origin is not None and self.metric and self.level
         return known and self.north == "true north"
+
+    def is_marked(self, kind: str) -> bool:
+        """True if a person marked the ``kind``: LENGTH or GRAVITY."""
+        return any((source.kind, source.reason) == (kind, MARKED) for source in self.sources)
+
+    @property
+    def gravity_measured(self) -> bool:
+        """True if telemetry has measured gravity."""
+        return self.level and not self.is_marked(GRAVITY)
 
     def pose(self, T_mc: Sim3) -> Sim3:
         """T_nc of a camera: rigid, as lengths in n have one unit; the same object if n is m."""

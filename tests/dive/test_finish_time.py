@@ -88,7 +88,7 @@ def test_only_some_held_out_views_are_evaluated_and_the_notes_say_so(ended: Ende
 def test_the_ground_is_not_measured_without_time_and_the_file_says_so(ended: Ended) -> None:
     numbers = json.loads((ended.finished.dive / "reef_numbers.json").read_text())
     assert "no more time" in numbers["missing"]["ground"]
-    assert numbers["numbers"]["path_length"]["value"] > 0.0
+    assert "no metres" in numbers["missing"]["lengths and areas"]
 
 
 def test_every_deliverable_is_there(ended: Ended) -> None:

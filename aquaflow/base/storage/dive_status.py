@@ -29,7 +29,8 @@ class DiveState(str, Enum):
     FINISHING = "finishing"
     """The pilot wants it finished; a process that ends now has left that undone."""
     RESCALING = "rescaling"
-    """Its files are being brought to metres; if that ends now, they have two units."""
+    """Its files are being brought to metres, or turned level; if that ends now, they contradict
+    each other."""
     STOPPED = "stopped"
     """The service was told to end: the deliverables are there, and the dive may go on."""
     FINISHED = "finished"
@@ -95,8 +96,8 @@ def unfinished_reason(dive: Path) -> str | None:
         return _why_cut_off(dive, live=False) if there and not _has_metrics(dive) else None
     if status.state is DiveState.RESCALING:
         return (
-            f"`aquaflow measure scale` was cut off in {dive}, whose files have two units of "
-            "length now; map its recording again: "
+            f"`aquaflow measure scale`, or `level`, was cut off in {dive}, whose files contradict "
+            "each other now; map its recording again: "
             f"`aquaflow map RECORDING --out {dive} --overwrite`"
         )
     if not status.state.is_complete:
@@ -159,8 +160,8 @@ def refuse_without_map(dive: Path) -> None:
 
 @contextmanager
 def rescaling(dive: Path) -> Iterator[None]:
-    """The block changes the unit of a finished dive's files; if it does not come to its end, every
-    reader says so.
+    """The block changes unit or axes of a finished dive's files; if it does not come to its end,
+    every reader says so.
 
     Raises:
         InputError: dive.json cannot be written.

@@ -108,7 +108,7 @@ def find_changes(asked: ChangeSettings, work: Path, progress: Progress) -> Chang
     """
     earlier, later = Dive(asked.first), Dive(asked.second)
     one, frame, other = earlier.filled_map(), earlier.frame, later.filled_map()
-    ground = ground_of(frame, one.views)
+    ground = ground_of(frame, one)
     first, voxel = surface_of(one, ground.T_gm, work, None, progress)
     second, _ = surface_of(other, ground.T_gm @ asked.T_ab, work, voxel, progress)
     resolution = max(first.resolution, second.resolution)

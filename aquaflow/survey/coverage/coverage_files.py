@@ -79,8 +79,9 @@ def numbers(view: PageView) -> dict[str, Any]:
     state, limit = view.state, view.plan.limit
     return {
         "unit": view.unit,
-        "area": {
-            seen.name.lower(): view.area(seen)
+        "area": view.areas,
+        "share": {
+            seen.name.lower(): view.share(seen)
             for seen in CoverageClass
             if seen is not CoverageClass.NOT
         },

@@ -225,7 +225,7 @@ def describe(view: PageView) -> dict[str, Any]:
     return {
         "size": [plan.classes.shape[1], plan.classes.shape[0]],
         "to_page": np.round(cells_affine(view), 6).tolist(),
-        "areas": {seen.name.lower(): round(view.area(seen), 3) for seen in plan.cells},
+        "areas": view.areas and {name: round(area, 3) for name, area in view.areas.items()},
         "range_limit": None if plan.limit is None else round(plan.limit * view.scale, 3),
         "swath": round(state.swath, 3),
         "overlap": None if state.overlap is None else round(state.overlap, 3),

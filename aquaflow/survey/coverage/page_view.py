@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.service import CoverageConfig
-from aquaflow.dive.placement import names_of, page_axes
+from aquaflow.dive.placement import FROM_ABOVE, names_of, page_axes
 from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
@@ -41,6 +41,22 @@ class PageView:
     def area(self, seen: CoverageClass) -> float:
         """Area of a class, in the square of ``unit``."""
         return self.plan.area(seen) * self.scale**2
+
+    def share(self, seen: CoverageClass) -> float:
+        """Of what was seen at all, on the page."""
+        return self.plan.cells.get(seen, 0) / max(1, sum(self.plan.cells.values()))
+
+    @property
+    def areas(self) -> dict[str, float] | None:
+        """m^2 of each class by name; None where the page is not level or not in metres: on it the
+        ground has another size than on a chart."""
+        if self.seen != FROM_ABOVE or self.unit != "m":
+            return None
+        return {
+            seen.name.lower(): self.area(seen)
+            for seen in CoverageClass
+            if seen is not CoverageClass.NOT
+        }
 
     def rescale(self, times: float, unit: str) -> PageView:
         """The same in another unit, of which one of before is ``times``."""

@@ -108,14 +108,23 @@ def answer(
     mapper, frame = dive.filled_map(), dive.frame
     drawn: HeightField | None = None
     ground: Ground | None = None
+    notes: list[str] = []
     if chosen != "line" or any(isinstance(each, GeodeticPoint) for each in asked):
-        ground = ground_of(frame, mapper.views)
-        drawn = draw_heights(mapper, ground, work, cell, progress)
-    reach = drawn.reach if drawn is not None else _reach(mapper, frame)
+        try:
+            ground = ground_of(frame, mapper)
+            drawn = draw_heights(mapper, ground, work, cell, progress)
+        except InputError as error:
+            if ground is not None or chosen != "area":
+                raise
+            notes.append(f"no area on a plan, and no surface with relief: {error}")
+    reach = drawn.reach if drawn is not None else width_seen(mapper, frame)
     points = locate(asked, mapper, frame, dive, drawn, ground, reach)
     scale = scale_of(frame)
-    if chosen == "line" or drawn is None or ground is None:
+    if chosen == "line":
         return PointMeasurements("line", points.places, {"length": path_length(points, scale)})
+    if drawn is None or ground is None:
+        measured = {"area": area(points, scale)}
+        return PointMeasurements("area", points.places, measured, notes=notes)
     R_gn = ground.T_gm.R @ frame.T_nm.R.T
     if chosen == "profile":
         found = profile(_line(drawn, R_gn, points), R_gn[2], scale)
@@ -126,7 +135,7 @@ def answer(
     return _area(drawn, R_gn, points, scale)
 
 
-def _reach(mapper: Mapper, frame: WorldFrame) -> float:
+def width_seen(mapper: Mapper, frame: WorldFrame) -> float:
     """Width of what a picture shows, median over some views, in n's unit."""
     step = max(1, len(mapper.views) // REACH_VIEWS)
     widths = []
@@ -169,7 +178,7 @@ def _area(
     plan = plan_area(points, R_gn[2], scale)
     found, notes = {"area": area(points, scale), "plan_area": plan}, []
     try:
-        ratio = surface_ratio(_within(drawn, (points.places @ R_gn.T)[:, :2]))
+        ratio = surface_ratio(_within(drawn, (points.places @ R_gn.T)[:, :2]), scale.tilt_sigma_rad)
         value = plan.value * ratio.value
         low, high = (
             float(np.hypot(ratio.value * (plan.value - edge), plan.value * (ratio.value - end)))

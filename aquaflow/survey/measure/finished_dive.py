@@ -59,6 +59,7 @@ def numbers_at_the_end(dive: Dive, until: Deadline) -> ReefNumbers:
         mapper = dive.maps.get(dive.main)
         if mapper is None or not mapper.views or len(mapper.gaussians) == 0:
             raise InputError("the map is empty; map a recording that shows more")
+        in_time("views", 0, len(mapper.views))
         return _draw(dive, mapper, dive.path, None, in_time)
 
     return reef_numbers(draw, _places(dive), _water(dive), scale_of(dive.frame))
@@ -69,7 +70,7 @@ def _draw(
 ) -> tuple[HeightField, Ground]:
     from aquaflow.survey.measure.drawn_heights import draw_heights  # loads torch
 
-    ground = ground_of(dive.frame, mapper.views)
+    ground = ground_of(dive.frame, mapper)
     return draw_heights(mapper, ground, work, cell, progress), ground
 
 

@@ -21,6 +21,7 @@ from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.earth import from_geodetic, geodetic
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
@@ -140,12 +141,10 @@ def list_notes(notes: Sequence[Note]) -> list[str]:
     return [f"{note.key:<{width}}  {words[note.shape]:<5}  {note.text}" for note in notes]
 
 
-def scale_notes(
-    notes: Sequence[Note],
-    times: float,
-) -> list[Note]:
-    """Notes of a dive whose lengths became ``times`` as long, as by ``aquaflow measure scale``."""
-    return [replace(note, places=note.places * times) for note in notes]
+def moved_notes(notes: Sequence[Note], change: Sim3) -> list[Note]:
+    """Notes of a dive whose n was brought to another by ``change``, as by ``aquaflow measure
+    scale``."""
+    return [replace(note, places=change.apply(note.places)) for note in notes]
 
 
 def _problem(note: Note) -> str | None:

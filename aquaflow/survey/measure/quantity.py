@@ -11,6 +11,11 @@ from aquaflow.telemetry.world_frame import WorldFrame
 NORMAL_95 = 1.959964
 """Standard deviations on each side of the mean that hold 95 % of a normal distribution."""
 
+NO_SIGMA = ".4g"
+"""How a number without a sigma is written."""
+POSSIBLE = {"": 1.0, "\u00b0": 90.0}
+"""What shares and slopes can be at most, by unit; ratios begin at 1."""
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -33,10 +38,27 @@ class Quantity:
     def in_words(self) -> str:
         """``12.34 +- 0.05 m``: with the digits that 1 sigma leaves, and 1 sigma."""
         unit = f" {self.unit}" if self.unit else ""
+        digits = self._digits
+        if digits == NO_SIGMA:
+            return f"{self.value:{digits}}{unit}"
+        return f"{self.value:{digits}} \u00b1 {self.sigma:{digits}}{unit}"
+
+    def interval_in_words(self) -> str:
+        """``12.24 to 12.44``: the 95 % interval, with the same digits."""
+        return f"{self.low:{self._digits}} to {self.high:{self._digits}}"
+
+    @property
+    def _digits(self) -> str:
+        """How a number is written that has this sigma: with two digits of it."""
         if not (math.isfinite(self.sigma) and self.sigma > 0.0):
-            return f"{self.value:.4g}{unit}"
-        decimals = max(0, 1 - math.floor(math.log10(self.sigma)))
-        return f"{self.value:.{decimals}f} \u00b1 {self.sigma:.{decimals}f}{unit}"
+            return NO_SIGMA
+        return f".{max(0, 1 - math.floor(math.log10(self.sigma)))}f"
+
+    @property
+    def says_something(self) -> bool:
+        """False where the 95 % interval is wider than the value, and than half of all values that
+        shares, ratios and angles can have."""
+        return self.high - self.low <= max(self.value, 0.5 * POSSIBLE.get(self.unit, 0.0))
 
     def to_json(self) -> dict[str, Any]:
         """``value``, ``sigma``, ``low_95``, ``high_95`` and ``unit``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,9 @@ Array = npt.NDArray[np.float64]
 
 SLOPES = {"slope_p10": 10.0, "slope_median": 50.0, "slope_p90": 90.0}
 """Percentiles of the slope by the name of their number."""
+LENGTHS = "lengths and areas"
+NO_METRES = "the dive has no metres; `aquaflow measure scale` gives it some"
+"""What is missing of a dive in map units, and why: one dive's are not another's."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +109,8 @@ def reef_numbers(
     try:
         field, ground = draw()
         cell, vertical = field.cell, ground.vertical
-        upright = scale if vertical == "along gravity" else replace(scale, tilt_sigma_rad=0.0)
-        numbers += of_area(field, upright)
-        numbers += of_relief(field, upright)
+        numbers += of_area(field, scale, vertical)
+        numbers += of_relief(field, scale, vertical)
     except InputError as error:
         missing["relief" if numbers else "ground"] = str(error)
     length = way(places, scale)
@@ -122,22 +124,35 @@ def reef_numbers(
         missing["visibility"] = (
             "the water is too clear to measure, or the dive saw nothing at several ranges"
         )
-    return ReefNumbers(numbers, missing, scale.unit, cell, vertical)
+    told = [each for each in numbers if _is_told(each, missing, scale)]
+    return ReefNumbers(told, missing, scale.unit, cell, vertical)
 
 
-def of_area(field: HeightField, scale: Scale) -> list[ReefNumber]:
+def _is_told(number: ReefNumber, missing: dict[str, str], scale: Scale) -> bool:
+    """False of what has no metres, or an interval that says nothing; then ``missing`` has why."""
+    quantity = number.quantity
+    if quantity.unit and scale.unit != "m" and quantity.unit.endswith(scale.unit):
+        missing[LENGTHS] = NO_METRES
+        return False
+    if not quantity.says_something:
+        missing[number.key] = f"its 95 % interval, {quantity.interval_in_words()}, says nothing"
+        return False
+    return True
+
+
+def of_area(field: HeightField, scale: Scale, vertical: str) -> list[ReefNumber]:
     """Areas and shares; without that of the surface where too little is mapped for its relief."""
     try:
-        ratio = surface_ratio(field)
+        ratio = surface_ratio(field, scale.tilt_sigma_rad)
     except InputError:
         ratio = None
     found = areas(field, ratio, scale)
     listed = [
         ("surveyed_area", "surveyed area", found.surveyed,
-         f"seen from above, of what {LEAST_VIEWS} mapped pictures show, at least"),
+         f"on the plan, of what {LEAST_VIEWS} mapped pictures show, vertical: {vertical}"),
         ("surface_area", "its surface", found.surface,
-         f"with its relief on {_cells(field, scale)}; what is not mapped is taken to be as rough "
-         "as the rest"),
+         f"with its relief on {_cells(field, scale, vertical)}; what is not mapped is taken to be "
+         "as rough as the rest"),
         ("mapped_share", "share that is in the map", found.mapped, "of the surveyed area"),
         ("seldom_seen_share", f"share that fewer than {WELL_SEEN} pictures show", found.seldom,
          "of the surveyed area"),
@@ -149,18 +164,18 @@ def of_area(field: HeightField, scale: Scale) -> list[ReefNumber]:
     ]
 
 
-def of_relief(field: HeightField, scale: Scale) -> list[ReefNumber]:
+def of_relief(field: HeightField, scale: Scale, vertical: str) -> list[ReefNumber]:
     """Rugosity, relief and slope.
 
     Raises:
         InputError: too little is mapped.
     """
-    tilt, cells = scale.tilt_sigma_rad, _cells(field, scale)
+    tilt, cells = scale.tilt_sigma_rad, _cells(field, scale, vertical)
     ends = f"{RELIEF_PERCENT[0]:g} % and {RELIEF_PERCENT[1]:g} %"
     listed = [
-        ("rugosity", "rugosity, surface over plan", surface_ratio(field),
+        ("rugosity", "rugosity, surface over plan", surface_ratio(field, tilt),
          f"area of the surface over that of its plan, on {cells}"),
-        ("chain_rugosity", "rugosity, chain over line", chain_ratio(field),
+        ("chain_rugosity", "rugosity, chain over line", chain_ratio(field, tilt),
          f"length of virtual chains over that of their lines, on {cells}, one link a cell"),
         ("relief", "relief", relief(field, tilt, scale.sigma, scale.unit),
          f"height between {ends} of the cells, on {cells}"),
@@ -171,8 +186,8 @@ def of_relief(field: HeightField, scale: Scale) -> list[ReefNumber]:
     return [ReefNumber(*each) for each in listed]
 
 
-def _cells(field: HeightField, scale: Scale) -> str:
-    return f"cells of {field.cell:g} {scale.unit}"
+def _cells(field: HeightField, scale: Scale, vertical: str) -> str:
+    return f"cells of {field.cell:g} {scale.unit}, vertical: {vertical}"
 
 
 # --------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ RELIEF_PERCENT = (2.0, 98.0)
 """Percentiles between which relief is measured: the extremes are single cells of the map's rim."""
 
 
-def surface_ratio(field: HeightField) -> Quantity:
+def surface_ratio(field: HeightField, tilt_sigma_rad: float = 0.0) -> Quantity:
     """Rugosity as the area of the surface over that of its plan, by triangles between cells.
 
     Each square of four cells is cut along both diagonals, and the mean taken. Friedman et al.,
@@ -53,10 +53,10 @@ def surface_ratio(field: HeightField) -> Quantity:
         each = [s * (2.0 + g2) / (1.0 + g2) ** 1.5 for g2 in squares]
         return float(np.nanmean(np.mean(each, axis=0)))
 
-    return _correct(field, mean, bias)
+    return _correct(field, mean, bias, tilt_sigma_rad)
 
 
-def chain_ratio(field: HeightField) -> Quantity:
+def chain_ratio(field: HeightField, tilt_sigma_rad: float = 0.0) -> Quantity:
     """Rugosity as the length of a chain laid over the ground, over that of its plan.
 
     The mean of virtual transects along all rows and columns of cells, with one link a cell. Risk,
@@ -83,10 +83,10 @@ def chain_ratio(field: HeightField) -> Quantity:
         each = [(noise / (1.0 + p**2) ** 1.5).ravel() for noise, p in links]
         return float(np.nanmean(np.concatenate(each)))
 
-    return _correct(field, mean, bias)
+    return _correct(field, mean, bias, tilt_sigma_rad)
 
 
-def slope(field: HeightField, percent: float, tilt_sigma_rad: float) -> Quantity:
+def slope(field: HeightField, percent: float, tilt_sigma_rad: float = 0.0) -> Quantity:
     """A percentile of the angle between the ground and the horizontal, degrees.
 
     Raises:
@@ -137,12 +137,18 @@ def relief(field: HeightField, tilt_sigma_rad: float, scale_sigma: float, unit: 
 
 
 def _correct(
-    field: HeightField, of: Callable[[Array], float], noise: Callable[[], float]
+    field: HeightField,
+    of: Callable[[Array], float],
+    noise: Callable[[], float],
+    tilt_sigma_rad: float,
 ) -> Quantity:
     """A ratio of the heights, less what noise adds, with what the resolution took."""
     plain = of(field.height)
     lost, added = max(0.0, plain - of(field.blurred)), noise()
-    half = float(np.hypot(added, lost))
+    # A vertical that errs along the ground's mean slope makes the plan larger or smaller by that.
+    steep = [np.nanmean(each) for each in np.gradient(field.height, field.cell)]
+    tilt = NORMAL_95 * tilt_sigma_rad * plain * float(np.linalg.norm(steep))
+    half = float(np.linalg.norm([added, lost, tilt]))
     return _between(max(1.0, plain - added + lost), half, half, "", 1.0)
 
 

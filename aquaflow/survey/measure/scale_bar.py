@@ -6,9 +6,7 @@ point of a picture is where its ray meets the map as the renderer draws it.
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,8 +23,13 @@ from aquaflow.survey.measure.picked import (
     RANGE_SIGMA,
     measure_pixels,
 )
-from aquaflow.survey.measure.reef_numbers import CSV, JSON, write_reef_numbers
-from aquaflow.survey.measure.rescaling import rescale, why_not
+from aquaflow.survey.measure.reframing import (
+    Progress,
+    measure_anew,
+    metric,
+    reframe,
+    why_not_metric,
+)
 from aquaflow.telemetry.known_lengths.known_length import (
     KnownLength,
     LengthScale,
@@ -121,9 +124,6 @@ def _largest(sub_maps: dict[int, int]) -> int:
 # --------------------------------------------------------------------------------------------------
 # A length that a person marked in a finished dive: kept, and the dive brought to metres by it.
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is done, how much of it, and how much there is."""
-
 
 @dataclass(frozen=True)
 class Marked:
@@ -161,28 +161,13 @@ def keep_length(dive: Path, known: KnownLength, progress: Progress | None = None
     together = scale_of(members)
     assert together is not None  # of one length at least
     read = Dive(dive)
-    unchanged = why_not(read.metric_frames.get(known.sub_map), together)
-    if unchanged is None:
-        rescale(read, known.sub_map, members, together)
+    frame = read.metric_frames.get(known.sub_map)
+    unchanged = why_not_metric(frame, together)
+    if frame is not None and unchanged is None:
+        reframe(read, known.sub_map, metric(frame, members, together))
         if known.sub_map == read.main:
-            _measure_anew(dive, progress)
+            measure_anew(dive, progress)
     return Marked(known, together, unchanged)
-
-
-def _measure_anew(dive: Path, progress: Progress | None) -> None:
-    """The dive's reef numbers in its new unit; none where it had none, or cannot be measured."""
-    if not (dive / JSON).is_file():
-        return
-    from aquaflow.survey.measure.finished_dive import numbers_of_dive
-
-    # Those in another unit would contradict the rest of the folder.
-    for name in (JSON, CSV):
-        (dive / name).unlink(missing_ok=True)
-    try:
-        with tempfile.TemporaryDirectory() as work:
-            write_reef_numbers(dive, numbers_of_dive(Dive(dive), Path(work), progress=progress))
-    except InputError:
-        return  # aquaflow measure says why
 
 
 def _plus_minus(metres: float, relative_sigma: float) -> str:

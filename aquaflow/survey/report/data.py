@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.dive.medium import Rgb
 from aquaflow.survey.coverage.page_view import PageView
+from aquaflow.survey.export.ortho.ground import ALONG_GRAVITY
 from aquaflow.telemetry.world_frame import SourceReport
 from aquaflow.water.mounting import Lamp
 
@@ -160,6 +161,8 @@ class ReportData:
     """Of the largest sub-map."""
     overview: bytes | None = None
     """PNG file of the map from above."""
+    vertical: str = ALONG_GRAVITY
+    """What is above on it and in ``reef``, in words."""
     profile: DepthProfile | None = None
     left_out: Sequence[LeftOut] = ()
     stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)

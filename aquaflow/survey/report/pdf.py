@@ -92,6 +92,7 @@ def _survey(pages: Pages, data: ReportData) -> None:
         pages.drawing(PROFILE_IN, profile_axes, data.profile)
     if data.reef:
         pages.heading("The ground in numbers, each with 1 sigma and its 95 % interval")
+        pages.paragraph(f"Vertical: {data.vertical}.")
         pages.table([
             (row.label, row.value, f"({row.interval})" if row.interval else row.meaning)
             for row in data.reef

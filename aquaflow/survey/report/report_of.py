@@ -19,6 +19,7 @@ from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.coverage.page_view import PageView
+from aquaflow.survey.export.ortho.ground import ACROSS_GROUND, ALONG_GRAVITY, OVERVIEW
 from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.reef_numbers import JSON as REEF
 from aquaflow.survey.report.data import (
@@ -34,8 +35,6 @@ from aquaflow.survey.report.data import (
 )
 from aquaflow.telemetry.world_frame import WorldFrame
 
-OVERVIEW = "overview.png"
-"""The map from straight above, in a dive's folder."""
 MAX_EXAMPLES = 6
 """Held-out frames shown, spread evenly over the dive."""
 
@@ -61,6 +60,7 @@ def report_of(dive: Dive) -> ReportData:
         medium=medium,
         coverage=_coverage(dive),
         overview=None if dive.is_going_on else _overview(dive),
+        vertical=ALONG_GRAVITY if frame.level else ACROSS_GROUND,
         profile=profile(dive.poses, frame),
         left_out=left_out(rows),
         stages=metrics.get("stage_ms", {}),
@@ -141,7 +141,7 @@ def _reef(dive: Dive) -> list[ReefRow]:
         missing = content["missing"].items()
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{dive.file(REEF)} is damaged; map the dive again") from error
-    return numbers + [ReefRow(what, "unknown", "", why) for what, why in missing]
+    return numbers + [ReefRow(what.replace("_", " "), "unknown", "", why) for what, why in missing]
 
 
 def _reef_row(number: dict[str, Any]) -> ReefRow:
@@ -149,8 +149,9 @@ def _reef_row(number: dict[str, Any]) -> ReefRow:
     value, sigma, low, high = (
         float(number[key]) for key in ("value", "sigma", "low_95", "high_95")
     )
-    words = Quantity(value, sigma, low, high, str(number["unit"])).in_words()
-    return ReefRow(number["label"], words, f"{low:.4g} to {high:.4g}", number["meaning"])
+    read = Quantity(value, sigma, low, high, str(number["unit"]))
+    words = read.in_words(), read.interval_in_words()
+    return ReefRow(number["label"], *words, number["meaning"])
 
 
 def _coverage(dive: Dive) -> PageView | None:

@@ -300,7 +300,7 @@ def coverage(data: ReportData) -> str:
     table = _survey_table(coverage_rows(view))
     return _survey_section(
         "What was seen", coverage_words(view), coverage_svg(view) + table
-    ) + overview(data.overview)
+    ) + overview(data.overview, data.vertical)
 
 
 def coverage_words(view: PageView) -> str:
@@ -313,37 +313,39 @@ def coverage_words(view: PageView) -> str:
 
 
 def coverage_rows(view: PageView) -> Rows:
-    """Areas, lines and overlap."""
-    unit = "m\u00b2" if view.unit == "m" else "square map units"
-    total = sum(view.area(seen) for seen in CoverageClass)
-    rows: Rows = [
-        (WORDS[seen], f"{view.area(seen):.3g} {unit} ({100.0 * view.area(seen) / total:.0f} %)")
-        for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR)
-        if total > 0.0
-    ]
+    """Areas, lines and overlap; without metres, or from aside, only shares."""
+    areas = view.areas
+    rows: Rows = []
+    for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR):
+        share = f"{100.0 * view.share(seen):.0f} %"
+        if areas is not None:
+            share = f"{areas[seen.name.lower()]:.3g} m\u00b2 ({share})"
+        rows.append((WORDS[seen], share))
     state, limit = view.state, view.plan.limit
-    if limit is not None:
-        rows.append(("range that the water allows", f"{limit * view.scale:.2g} {view.unit}"))
-    if state.lines:
-        length = sum(line.length for line in state.lines)
-        rows.append(("survey lines", f"{len(state.lines)}, together {length:.4g} {view.unit}"))
-        rows.append(("width of the swath", f"{state.swath:.3g} {view.unit}"))
+    if view.unit == "m":
+        if limit is not None:
+            rows.append(("range that the water allows", f"{limit * view.scale:.2g} m"))
+        if state.lines:
+            length = sum(line.length for line in state.lines)
+            rows.append(("survey lines", f"{len(state.lines)}, together {length:.4g} m"))
+            rows.append(("width of the swath", f"{state.swath:.3g} m"))
     if state.overlap is not None:
         said = f"{100.0 * state.overlap:.0f} % of the swath"
-        gap = f"none: a gap of {-state.overlap * state.swath:.2g} {view.unit}"
-        rows.append(("overlap of the last two lines", said if state.overlap >= 0.0 else gap))
+        if state.overlap < 0.0:
+            said = f"none: a gap of {-100.0 * state.overlap:.0f} % of it"
+        rows.append(("overlap of the last two lines", said))
     return rows
 
 
-def overview(png: bytes | None) -> str:
-    """The map from straight above, without water."""
+def overview(png: bytes | None, vertical: str) -> str:
+    """The map from above, without water."""
     if png is None:
         return ""
     source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     return _survey_section(
         "The map from above",
-        "Drawn from the map without water, as seen from straight above; aquaflow export --format "
-        "ortho writes it as a GeoTIFF.",
+        f"Drawn from the map without water; vertical: {vertical}. aquaflow export --format ortho "
+        "writes it as a GeoTIFF.",
         f'<figure class="overview"><img alt="the map from above" src="{source}"></figure>',
     )
 

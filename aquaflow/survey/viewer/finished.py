@@ -16,6 +16,8 @@ from aquaflow.base.storage.dive_status import unfinished_reason
 from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import CAMERA, FRAMES, TRAJECTORY, Dive
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.survey.measure.points import MOST_POINTS
+from aquaflow.survey.measure.shapes import LEAST_CORNERS
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path
 from aquaflow.survey.viewer.levels import Palette
@@ -24,7 +26,7 @@ from aquaflow.survey.viewer.packing import PackedFile, key_of, read_packed, writ
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.survey.viewer.splats import ViewerSplats
-from aquaflow.survey.viewer.tools import SCALE, PinnedNotes, Tools
+from aquaflow.survey.viewer.tools import LEVEL, SCALE, PinnedNotes, Tools
 from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
@@ -148,9 +150,11 @@ def open_dive(
     config: ViewerConfig,
     mark: Mark | None = None,
     white_balance: str | None = None,
+    turn: Turn | None = None,
 ) -> ViewerPage:
-    """The page of the finished dive in ``folder``, with its notes and, by ``mark``, its scale bar;
-    in another ``white_balance`` than its own, where one is given.
+    """The page of the finished dive in ``folder``, with its notes, its scale bar (by ``mark``) and,
+    where telemetry has not measured gravity, what turns it level (by ``turn``); in another
+    ``white_balance`` than its own, where one is given.
 
     Raises:
         InputError: there is no finished dive, the address is taken, or the dive cannot be shown in
@@ -174,9 +178,17 @@ def open_dive(
             fill(page[0], read())
         return said
 
+    def level(given: Asked) -> Asked:
+        assert turn is not None
+        words = turn(level_places(given))
+        fill(page[0], read())
+        return {"words": words}
+
     if mark is not None:
         tools.others[SCALE] = scale
     dive = read()
+    if turn is not None and not dive.frame.gravity_measured:
+        tools.others[LEVEL] = level
     page.append(show_dive(dive, config, tools))
     prepare(folder, dive.key, dive.packed, dive.map, page[0])
     return page[0]
@@ -237,7 +249,7 @@ def in_chosen_white(dive: Dive, water: SeenWater) -> SeenWater:
 
 
 # --------------------------------------------------------------------------------------------------
-# The scale bar: two points of the map and the true length between them.
+# The scale bar: two points of the map and the true length between them. Points on a level plane.
 
 Place: TypeAlias = tuple[float, float, float]
 Mark: TypeAlias = Callable[[tuple[Place, Place], float, float], tuple[str, bool]]
@@ -258,6 +270,23 @@ def mark_coverage(given: Asked, mark: Mark) -> Asked:
     length, sigma = (_metres(given.get(name), name) for name in ("length_m", "sigma_m"))
     words, rescaled = mark(((a[0], a[1], a[2]), (b[0], b[1], b[2])), length, sigma)
     return {"words": words, "rescaled": rescaled}
+
+
+Turn: TypeAlias = Callable[[list[Place]], str]
+"""Turns the dive's files level by points of its map; returns sentences about it."""
+
+
+def level_places(given: Asked) -> list[Place]:
+    """The points of something level that a browser marked.
+
+    Raises:
+        InputError: they are none, too few or too many.
+    """
+    places = given.get("places")
+    if not isinstance(places, list) or not LEAST_CORNERS <= len(places) <= MOST_POINTS:
+        raise InputError(f"a plane has {LEAST_CORNERS} to {MOST_POINTS} points; mark them again")
+    found = [vector(place, "a point of the plane") for place in places]
+    return [(float(x), float(y), float(z)) for x, y, z in found]
 
 
 def _metres(given: Any, name: str) -> float:

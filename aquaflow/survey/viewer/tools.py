@@ -28,7 +28,7 @@ from aquaflow.survey.viewer.picking import pick
 from aquaflow.survey.viewer.viewer_content import ShownMap, ViewerContent
 from aquaflow.telemetry.world_frame import WorldFrame
 
-NOTES, SCALE = ("notes/list", "notes/add", "notes/remove"), "scale"
+NOTES, SCALE, LEVEL = ("notes/list", "notes/add", "notes/remove"), "scale", "level"
 """Names of the tools that a finished dive has besides."""
 BUSY_S = 20.0
 """A browser waits so long for the one before it; then it is told so."""
@@ -45,7 +45,8 @@ class Tools:
 
     def can(self) -> tuple[str, ...]:
         """Which buttons the page has besides those that measure."""
-        found = {"note": set(NOTES) <= set(self.others), "scale": SCALE in self.others}
+        found = {"note": set(NOTES) <= set(self.others)}
+        found |= {name: name in self.others for name in (SCALE, LEVEL)}
         return tuple(name for name, there in found.items() if there)
 
     def ask(self, name: str, given: Asked) -> Asked:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,6 +19,7 @@ from aquaflow.config import Config
 from aquaflow.dive import replay
 from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
 from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.metric_outputs import MetricOutputs
 from aquaflow.dive.run import Finished
 from aquaflow.mapping import scene_water as water_fitting
 from aquaflow.mapping.mapper import Mapper
@@ -26,6 +28,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.gate import FrameGate
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
@@ -288,7 +291,8 @@ def test_files_that_cannot_be_written_leave_the_others(
             monkeypatch.setattr(others[name], "make", fail)
         else:
             monkeypatch.setattr(folder, name, fail)
-    made = Deliverables("planted", folder, slam, slam.results(), None, others=others)
+    known = MetricOutputs({0: replace(WorldFrame.unknown(), level=True)})  # else no overview
+    made = Deliverables("planted", folder, slam, slam.results(), None, known, others=others)
     made.summarise()
     made.write()
     made.make(DeliverablePhase.WRITE)

@@ -84,8 +84,8 @@ def test_a_change_of_unit_that_was_cut_off_is_told_and_one_that_ended_is_not(
     before = DiveStatus(DiveState.STOPPED, boot="boot", begun_utc="2026-01-01T00:00:00Z")
     dive = dive_in(tmp_path, before, {})
     with rescaling(dive):
-        assert "two units of length" in (unfinished_reason(dive) or "")
+        assert "contradict each other" in (unfinished_reason(dive) or "")
     assert read_status(dive) == before
     with pytest.raises(KeyError), rescaling(dive):
         raise KeyError
-    assert "two units of length" in (unfinished_reason(dive) or "")
+    assert "contradict each other" in (unfinished_reason(dive) or "")

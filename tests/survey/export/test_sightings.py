@@ -30,7 +30,7 @@ def mapper() -> Mapper:
 
 def ground(mapper: Mapper) -> Ground:
     frame = metric_frame(T_nm=Sim3.identity(), origin=None, north="initial heading")
-    return ground_of(frame, mapper.views)
+    return ground_of(frame, mapper)
 
 
 def ground_point(north: float, east: float, above: float = 0.0) -> Array:

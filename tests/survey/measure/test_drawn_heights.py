@@ -46,7 +46,7 @@ def drawn(mapper: Mapper, tmp_path_factory: pytest.TempPathFactory) -> HeightFie
 
 
 def ground(mapper: Mapper) -> Ground:
-    return ground_of(FRAME, mapper.views)
+    return ground_of(FRAME, mapper)
 
 
 def truth(field: HeightField) -> HeightField:

@@ -11,12 +11,13 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.earth import latitude_longitude
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.measure.notes import (
     MOST_NOTES,
     NAME,
     Note,
+    moved_notes,
     read_notes,
-    scale_notes,
     write_notes,
 )
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -87,7 +88,11 @@ def test_notes_grow_with_a_dive_that_becomes_metric(tmp_path: Path) -> None:
     metric = metric_frame(**LOCAL)
     with pytest.raises(InputError, match="is in map units, and the dive in m"):
         read_notes(tmp_path, metric)
-    write_notes(tmp_path, scale_notes(read_notes(tmp_path, WorldFrame.unknown()), 2.5), metric)
+    write_notes(
+        tmp_path,
+        moved_notes(read_notes(tmp_path, WorldFrame.unknown()), Sim3(np.eye(3), np.zeros(3), 2.5)),
+        metric,
+    )
     np.testing.assert_allclose(read_notes(tmp_path, metric)[0].places, [[30.0, -18.75, 23.125]])
 
 

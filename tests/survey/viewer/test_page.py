@@ -24,6 +24,7 @@ from aquaflow.survey.viewer.seen_water import water_of
 from aquaflow.survey.viewer.splats import splats
 from aquaflow.survey.viewer.tools import PinnedNotes, Tools
 from aquaflow.telemetry.metric_file import write_metric_file
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import metric_frame
 from tests.small_recording import HEIGHT, WIDTH
 
@@ -218,6 +219,41 @@ def test_a_scale_bar_reaches_the_dive_and_the_page_shows_the_new_unit(dive: Path
     assert said == {"words": "1 map unit is 2 m", "rescaled": True}
     assert before["can"] == ("note", "scale")
     assert (before["unit"], after["unit"]) == ("map units", "m")
+
+
+def test_points_on_something_level_reach_the_dive_and_turn_the_page(dive: Path) -> None:
+    (dive / "metric.json").unlink()
+    write_metric_file(dive, {0: WorldFrame.unknown()}, main=0)
+    asked: list[Any] = []
+
+    def turn(places: Any) -> str:
+        asked.append(places)
+        write_metric_file(dive, {0: metric_frame()}, main=0)
+        return "The vertical is known"
+
+    page = open_dive(dive, ViewerConfig(port=0, splats=100), None, None, turn)
+    try:
+        before = page._exhibit.scene()
+        for bad in ({}, {"places": [[0, 0, 1]] * 2}, {"places": [[0, 0, None]] * 3}):
+            with pytest.raises(InputError):
+                page._tools.ask("level", bad)
+        said = page._tools.ask("level", {"places": [[0, 0, 1], [1, 0, 1], [0, 1, 1]]})
+        after = page._exhibit.scene()
+    finally:
+        page.close()
+    assert asked == [[(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)]]
+    assert said == {"words": "The vertical is known"}
+    assert before["can"] == ("note", "level")
+    assert before["up"] != after["up"]
+
+
+def test_a_dive_whose_gravity_was_measured_offers_no_level(dive: Path) -> None:
+    write_metric_file(dive, {0: metric_frame()}, main=0)
+    page = open_dive(dive, ViewerConfig(port=0, splats=100), None, None, lambda _: "turned")
+    try:
+        assert page._exhibit.scene()["can"] == ("note",)
+    finally:
+        page.close()
 
 
 @pytest.mark.parametrize(

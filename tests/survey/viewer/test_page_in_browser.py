@@ -223,6 +223,21 @@ def test_a_note_is_kept_in_the_dive_shown_and_removed(shown: Browser) -> None:
     shown.wait("!document.querySelector('#notes li')")
 
 
+def test_three_points_on_something_level_turn_the_map(browser: Browser, page: ViewerPage) -> None:
+    page._tools.others["level"] = lambda given: {"words": f"level by {len(given['places'])}"}
+    page._exhibit.can = page._tools.can()
+    try:
+        show(browser, page, SCREEN)
+        browser.click("[data-tool=level]")
+        for count, at in enumerate([(0.4, 0.4), (0.6, 0.4), (0.5, 0.6)], 1):
+            point(browser, *at, count)
+        browser.click("#level-form button")
+        browser.wait("document.querySelector('#result').innerText === 'level by 3'")
+    finally:
+        del page._tools.others["level"]
+        page._exhibit.can = page._tools.can()
+
+
 def test_the_cameras_picture_stands_beside_the_map_from_its_pose(shown: Browser) -> None:
     shown.click("#beside")
     shown.wait("document.querySelector('#picture').naturalWidth > 0")

@@ -24,6 +24,7 @@ from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
 from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground
+from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.water.tone import ShownTone
 
 Array = npt.NDArray[np.float64]
@@ -56,12 +57,15 @@ class DrawnTile:
 
 
 class GroundSplats:
-    """The Gaussians of a map on the ground."""
+    """The Gaussians of a map on the ground, without those in open water."""
 
     def __init__(self, mapper: Mapper, ground: Ground) -> None:
         """With a decoder, each Gaussian is as the view nearest to it sees it."""
         self._renderer: Renderer = mapper.renderer
-        self._splats = splats_of(mapper).transform(ground.T_gm)
+        splats = splats_of(mapper)
+        if mapper.medium.active:
+            splats = splats.rows(~ShownViews(mapper).in_open_water(splats.means.astype(np.float64)))
+        self._splats = splats.transform(ground.T_gm)
         self._reach = RADIUS_SIGMAS * self._splats.scales.max(axis=1, initial=0.0)
 
     @property

@@ -7,7 +7,6 @@ dive is georeferenced, else the ground's own x and y.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,16 +19,29 @@ from aquaflow.geometry.similarity import Sim3, nearest_rotation
 from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
-    from aquaflow.render.views import View
+    from aquaflow.mapping.mapper import Mapper
 
 Array = npt.NDArray[np.float64]
 
 LEAST_VIEWS = 2
 """That see a pixel, or it is a hole: what one view alone sees has no parallax. On the surveys 1 and
 7 it is smears along the rim, whose heights are guesses."""
-LEAST_AGREEMENT = 0.5
-"""Length of the mean of the views' unit axes; at 0.5 they spread over a half-angle of 90 degrees,
-and no direction is below all of them."""
+LARGEST_LOOK_DEG = 30.0
+"""Between the cameras' mean viewing direction and the normal of what they show, up to which that
+plane is taken for the ground, seen squarely. The surveys 1, 3, 6 and 7, which look down, have 14,
+4, 2 and 10; the reef clip, which looks ahead, has 61."""
+ALONG_GRAVITY = "along gravity"
+ACROSS_GROUND = "perpendicular to the mean plane of the ground; gravity is unknown"
+"""What the vertical is, in words."""
+NO_VERTICAL = (
+    "nothing says which way is down; give it by `aquaflow measure level`, or map with the "
+    "vehicle's attitude (--telemetry)"
+)
+
+OVERVIEW = "overview.png"
+"""The map from above, in a dive's folder."""
+NO_OVERVIEW = "no map from above was drawn"
+"""Begins the note that says why."""
 
 
 @dataclass(frozen=True)
@@ -57,41 +69,51 @@ class Ground:
         return Sim3(T.R, T.t)
 
 
-def ground_of(frame: WorldFrame, views: Sequence[View]) -> Ground:
-    """The ground of a sub-map.
+def ground_of(frame: WorldFrame, mapper: Mapper) -> Ground:
+    """The ground of a sub-map: level where gravity is known, else the mean plane of what its views
+    show, where that is one and they look squarely at it.
 
     Raises:
-        InputError: gravity is unknown, and the views look in all directions.
+        InputError: gravity is unknown, and there is no such plane.
     """
-    poses = [frame.pose(view.T_wc) for view in views]
-    middle = np.mean([T_nc.t for T_nc in poses], axis=0)
+    poses = [frame.pose(view.T_wc) for view in mapper.views]
     epsg, corner, grid_scale = None, (0.0, 0.0), 1.0
     if frame.level:
-        R_gn, vertical = UPRIGHT_FROM_DOWN, "along gravity"
+        R_gn, vertical = UPRIGHT_FROM_DOWN, ALONG_GRAVITY
         grid = grid_of(frame)
         if grid is not None:
+            middle = np.mean([T_nc.t for T_nc in poses], axis=0)
             epsg = grid.epsg
             turn, grid_scale = grid.axes(middle)
             R_gn = turn @ UPRIGHT_FROM_DOWN
             place = grid.places(middle[None])[0]
             corner = tuple((place - grid_scale * (R_gn @ middle)[:2]).tolist())
     else:
-        R_gn, vertical = _below_views(poses), "against the mean viewing direction of the cameras"
+        R_gn, vertical = _on_mean_plane(poses, frame.T_nm.R, mapper), ACROSS_GROUND
     return Ground(
         Sim3(R_gn, np.zeros(3)) @ frame.T_nm, frame.unit, epsg, corner, grid_scale,
         _axes_in_words(frame, epsg), vertical, _zero_in_words(frame),
     )  # fmt: skip
 
 
-def _below_views(poses: Sequence[Sim3]) -> Array:
-    """R_gn [3, 3]: up is against the mean viewing direction, y is up in the pictures."""
-    axes = np.mean([T_nc.R for T_nc in poses], axis=0)
-    if np.linalg.norm(axes[:, 2]) < LEAST_AGREEMENT:
+def _on_mean_plane(
+    poses: list[Sim3],
+    R_nm: Array,  # [3, 3]
+    mapper: Mapper,
+) -> Array:
+    """R_gn [3, 3]: up is the normal of what the views show, y is up in the first picture."""
+    from aquaflow.survey.export.ortho.shown_views import ShownViews, mean_normal  # loads torch
+
+    normal = mean_normal(ShownViews(mapper).points())
+    if normal is None:
+        raise InputError(f"what the cameras see lies about no plane, and {NO_VERTICAL}")
+    up, look = R_nm @ normal, np.mean([T_nc.R[:, 2] for T_nc in poses], axis=0)
+    up = -up * np.sign(up @ look)
+    aside = np.degrees(np.arccos(min(1.0, -up @ look / max(np.linalg.norm(look), 1e-12))))
+    if aside > LARGEST_LOOK_DEG:
         raise InputError(
-            "nothing says which way is up in this dive, and its cameras look in all directions; "
-            "map it with the vehicle's attitude (--telemetry)"
+            f"the cameras look at the ground from {aside:.0f} degrees aside, and {NO_VERTICAL}"
         )
-    up = -axes[:, 2] / np.linalg.norm(axes[:, 2])
     # A survey's lines go there and back, so that only the first picture's top is sure to exist.
     y = -poses[0].R[:, 1]
     y = y - up * (up @ y)

@@ -17,10 +17,9 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import scratch_array
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View, in_time
 from aquaflow.survey.export.ortho.ground import Ground
-from aquaflow.water.sightings import SOLID
+from aquaflow.survey.export.ortho.shown_views import OPEN, solid_ranges
 
 Array = npt.NDArray[np.float64]
 
@@ -71,10 +70,8 @@ class ViewRanges:
         self._starts = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
         self._all = scratch_array(work, (int(self._starts[-1]),), np.float16)
         for number, view in enumerate(self._views):
-            shown = mapper.show(view)
-            z = picture_out(shown.z) * ground.T_gm.scale
-            z = np.where(picture_out(shown.alpha) > SOLID, z, 0.0)
-            self._of(number)[:] = z[::STRIDE_PX, ::STRIDE_PX]
+            z = solid_ranges(mapper, view)[::STRIDE_PX, ::STRIDE_PX]
+            self._of(number)[:] = np.where(z == OPEN, OPEN, z * ground.T_gm.scale)
             if progress is not None:
                 progress(number + 1, len(self._views))
         self._survey()
@@ -85,7 +82,8 @@ class ViewRanges:
         return -(-view.camera.height // STRIDE_PX), -(-view.camera.width // STRIDE_PX)
 
     def _of(self, number: int) -> npt.NDArray[np.float16]:
-        """[rows, columns] ranges of a view, 0 where the map is not solid; to be written, too."""
+        """[rows, columns] ranges of a view, 0 where the map is not solid, OPEN where it shows open
+        water; to be written, too."""
         part = self._all[self._starts[number] : self._starts[number + 1]]
         return part.reshape(self._size(self._views[number]))
 
@@ -146,8 +144,8 @@ class ViewRanges:
         """[M] how many views show the place of each point, ``margin_px`` inside their edges.
 
         Unlike :meth:`see` this asks nothing of the map at the point, only that it has nothing
-        before it, and that the view shows something as far away: a place that was filmed and not
-        mapped is held.
+        before it, no open water behind it, and that the view shows something as far away: a place
+        that was filmed and not mapped is held.
         """
         count = np.zeros(len(points), np.int32)
         low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -157,7 +155,7 @@ class ViewRanges:
             z = self._of(number)
             inside, rows, columns, ranges = self._project(number, points, margin_px)
             shown = z[rows, columns]
-            hidden = (shown > 0.0) & (ranges > (1.0 + SAME_RANGE) * shown)
+            hidden = (shown != 0.0) & (ranges > (1.0 + SAME_RANGE) * shown)
             farthest = min(float(z.max()), FAR * self.median_range)
             count[inside[~hidden & (ranges <= farthest)]] += 1
         return count

@@ -17,7 +17,6 @@ from aquaflow import __version__
 from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, Colours, GroundSplats
 from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
 from aquaflow.survey.export.ortho.grid import (
@@ -30,6 +29,7 @@ from aquaflow.survey.export.ortho.grid import (
     round_to_digits,
 )
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
+from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.sightings import SOLID
@@ -88,13 +88,13 @@ def export_survey(
         water: of an ortho: with the water, as seen from the views' median range.
 
     Raises:
-        InputError: rasterio is missing, the dive has no map or views, the raster would be too
-            large, or a file cannot be written.
+        InputError: rasterio is missing, the dive has no map, views or ground (``ground_of``), the
+            raster would be too large, or a file cannot be written.
         ConfigError: the dive's settings cannot be read.
     """
     require_rasterio()
     mapper, frame = dive.filled_map(), dive.frame
-    ground = ground_of(frame, mapper.views)
+    ground = ground_of(frame, mapper)
     ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
     side = resolution or round_to_digits(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
@@ -184,13 +184,9 @@ Array = npt.NDArray[np.float64]
 
 LONGER_SIDE_PX = 720
 """Of the picture, about."""
-MOST_VIEWS = 30
-"""Views whose ranges say how far the picture reaches."""
 SHOWN = (2.0, 98.0)
 """Percent of what these views show, along each axis, within which the picture lies: beyond are
 single Gaussians in the water."""
-REACH = 3.0
-"""Times the median range up to which what a view shows counts, as in the ortho."""
 SOLID_ALPHA = 0.5
 """Cover of a pixel above which the map is there."""
 
@@ -199,11 +195,11 @@ def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
     """A PNG file, transparent where the map is not; its top is what is up on the ground's axes.
 
     Raises:
-        InputError: nothing says which way is up, and the views look in all directions.
+        InputError: the map has no ground (``ground_of``).
     """
     from PIL import Image
 
-    ground = ground_of(frame, mapper.views)
+    ground = ground_of(frame, mapper)
     low, high, distance = _extent(mapper, ground)
     pixel = round_to_digits(float((high - low).max()) / LONGER_SIDE_PX)
     grid = Grid.around(low, high, pixel, low)
@@ -236,18 +232,14 @@ def _tile(
 
 def _extent(mapper: Mapper, ground: Ground) -> tuple[Array, Array, float]:
     """Lowest and highest x, y [2] of what the views show, and their median range."""
-    step = max(1, len(mapper.views) // MOST_VIEWS)
-    places, ranges = [], []
-    for view in mapper.views[::step]:
-        z = picture_out(mapper.show(view).z)[::8, ::8].astype(np.float64) * ground.T_gm.scale
-        rays = view.camera.unproject(view.camera.pixel_centres()[::8, ::8])
-        unit = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        near = (z > 0.0) & (z < REACH * np.median(z[z > 0.0])) if (z > 0.0).any() else z > 0.0
-        places.append(ground.pose(view.T_wc).apply((unit * z[..., None])[near])[:, :2])
-        ranges.append(z[near])
-    every = np.concatenate(places)
-    if len(every) == 0:
+    shown = ShownViews(mapper).points()
+    if not shown:
         every = np.array([ground.pose(view.T_wc).t[:2] for view in mapper.views])
         return every.min(axis=0) - 1.0, every.max(axis=0) + 1.0, 1.0
-    low, high = np.percentile(every, SHOWN, axis=0)
-    return low, high, float(np.median(np.concatenate(ranges)))
+    places = ground.T_gm.apply(np.concatenate([each.places for each in shown]))
+    low, high = np.percentile(places[:, :2], SHOWN, axis=0)
+    return (
+        low,
+        high,
+        ground.T_gm.scale * float(np.median(np.concatenate([each.ranges for each in shown]))),
+    )

@@ -1,4 +1,4 @@
-// Measuring, notes and the scale bar: points on the map, which the server finds and measures.
+// Measuring, notes, the scale bar and level: points on the map, which the server finds and measures.
 
 import { tell } from "./load.js";
 
@@ -8,6 +8,7 @@ const HINTS = {
   profile: "Point at both ends of the profile.",
   note: "Point at where the note belongs.",
   scale: "Point at both ends of a known length.",
+  level: "Point at three or more places of something level, far apart.",
 };
 const MOST = { profile: 2, note: 1, scale: 2 };
 const LEAST = { distance: 2, area: 3, profile: 2 };
@@ -22,11 +23,12 @@ export class ToolBox {
     find("again").addEventListener("click", () => this.choose(this.tool));
     find("note-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.keepNote()); });
     find("scale-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.setScale()); });
+    find("level-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.setLevel()); });
   }
 
   offer(can) {
     this.can = can;
-    for (const name of ["note", "scale"]) document.querySelector(`[data-tool=${name}]`).hidden = !can.includes(name);
+    for (const name of ["note", "scale", "level"]) document.querySelector(`[data-tool=${name}]`).hidden = !can.includes(name);
     if (can.includes("note")) this.guarded(() => this.showNotes());
   }
 
@@ -38,7 +40,7 @@ export class ToolBox {
     for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
     find("hint").textContent = HINTS[tool] || "";
     this.result("");
-    for (const id of ["note-form", "scale-form", "again"]) find(id).hidden = true;
+    for (const id of ["note-form", "scale-form", "level-form", "again"]) find(id).hidden = true;
     this.marks.canvas.classList.toggle("pointing", tool !== null);
     this.show();
   }
@@ -77,6 +79,7 @@ export class ToolBox {
     this.show();
     find("note-form").hidden = !(tool === "note" && this.can.includes("note"));
     find("scale-form").hidden = !(tool === "scale" && this.points.length === 2);
+    find("level-form").hidden = !(tool === "level" && this.points.length >= 3);
     if (tool === "note") find("note-text").focus();
     if (this.points.length >= (LEAST[tool] ?? Infinity)) await this.measure(turn);
   }
@@ -104,6 +107,13 @@ export class ToolBox {
     this.result(said.words);
     find("scale-form").hidden = true;
     if (said.rescaled) setTimeout(() => location.reload(), 2500);
+  }
+
+  async setLevel() {
+    const said = await tell("level", { places: this.points.map(point => point.place) });
+    this.result(said.words);
+    find("level-form").hidden = true;
+    setTimeout(() => location.reload(), 2500);
   }
 
   async showNotes() {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,12 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.trajectory_csv import read_trajectory_csv
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.measure import finished_dive
+from aquaflow.survey.measure.finished_dive import numbers_of_dive
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
+from aquaflow.survey.measure.reframing import reframe
 from aquaflow.survey.measure.scale_bar import keep_length
 from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
@@ -103,7 +106,15 @@ def test_a_length_that_is_marked_anew_replaces_the_scale(dive: Path, command: Cl
     assert said["all_metres_per_unit"] == pytest.approx(3.1, abs=0.05)
 
 
-def test_the_ground_is_measured_anew_in_metres_and_in_the_report(dive: Path, command: Cli) -> None:
+def test_the_ground_is_measured_anew_in_metres_and_in_the_report(
+    small_dive: Path, tmp_path: Path, command: Cli
+) -> None:
+    dive = Path(shutil.copytree(small_dive, tmp_path / "level"))
+    known = read_metric_file(dive)[0]
+    reframe(Dive(dive), 0, replace(known, T_nm=Sim3(known.T_nm.R, np.zeros(3)), metric=False))
+    numbers_before = numbers_of_dive(Dive(dive), tmp_path)
+    assert numbers_before.missing["lengths and areas"].startswith("the dive has no metres")
+    assert not {"surveyed_area", "path_length"} & {each.key for each in numbers_before.numbers}
     ran = command("measure", "scale", dive, *LENGTH)
     assert ran.code == 0, ran.err
     content = json.loads((dive / "reef_numbers.json").read_text())
