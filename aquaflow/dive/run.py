@@ -335,12 +335,12 @@ class DiveRun:
             made.evaluate(limits.evaluating)
         with self.profiler.stage("measure"):
             made.make(DeliverablePhase.MEASURE, limits.evaluating)
-            self.notes += made.notes
+            self._add_notes(made.notes)
         with self.profiler.stage("write"):
             made.write_evaluation()
         self.check_calibration()
         if self.calibration is not None and self.lens_error is None:
-            self.notes.append(UNCHECKED)
+            self._add_notes([UNCHECKED])
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()
             made.make(DeliverablePhase.REPORT, limits.whole, self._numbers(results, made))
@@ -353,6 +353,12 @@ class DiveRun:
         self._settle(before)
         notes = self.notes + self.slam.failures.notes()
         return Finished(self.folder.path, numbers, notes, self.warnings)
+
+    def _add_notes(self, notes: list[str]) -> None:
+        """For the user; the log has them too, as it has those of the frames."""
+        self.notes += notes
+        for note in notes:
+            log.info(note)
 
     def _settle(self, before: dict[Path, int]) -> None:
         """The files of the dive are of one moment: what was there ``before`` and was not written
