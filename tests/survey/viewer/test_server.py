@@ -17,6 +17,7 @@ from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.service import ViewerConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.render import wgsl
 from aquaflow.survey.viewer.page import MOST_BYTES, ViewerPage
 from tests.survey.viewer.planes import floor
 
@@ -114,6 +115,14 @@ def test_the_pages_files_are_small_and_sent_again_only_when_they_changed(page: V
         assert get(page, name, **{"If-None-Match": headers["ETag"]})[:2] == (304, b"")
         total += len(data)
     assert total < 30_000
+
+
+def test_the_page_gets_the_kernels_that_maps_are_optimised_with(page: ViewerPage) -> None:
+    for name in ("project", "sort", "sum"):
+        status, data, headers = get(page, f"/client/{name}.wgsl")
+        kernels = (Path(wgsl.__file__).parent / f"{name}.wgsl").read_text()
+        assert (status, headers["Content-Type"]) == (200, "text/plain; charset=utf-8")
+        assert gzip.decompress(data).decode().endswith(kernels)
 
 
 def test_a_chunk_is_kept_by_the_browser_and_another_map_has_another_address(

@@ -91,7 +91,7 @@ async function update() {
   await showPath(scene.path);
   line.setScene(scene);
   if (!scene.map) { say("There is no map yet."); return; }
-  if (!drawing) begin();
+  if (!drawing) await begin();
   looks.offer(scene.map, scene.unit, scene.metres);
   if (!looking) { looking = true; home(); }
   const done = due && showMap(scene.map, coming).catch(error => say(error.message));
@@ -99,8 +99,8 @@ async function update() {
   say("");
 }
 
-function begin() {
-  drawing = new Drawing(find("map"), drawn);
+async function begin() {
+  drawing = await Drawing.on(find("map"), drawn);
   looks.begin(drawing, divider(find("divider"), find("view"), share => { drawing.look.wipe = looks.wiping ? share : null; changed(); }));
   tools.offer(scene.can);
   const turn = () => { drawing.turn(eye); requestAnimationFrame(turn); };
