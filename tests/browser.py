@@ -31,6 +31,10 @@ WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 WEBGPU = ("--enable-unsafe-webgpu", "--enable-features=Vulkan", "--use-vulkan=swiftshader")
 """Besides, where it may draw by WebGPU. With fewer of them there is an adapter too, whose device is
 lost at the first picture."""
+AS_GPU = """
+    if (globalThis.GPUAdapterInfo) Object.defineProperty(
+      GPUAdapterInfo.prototype, 'isFallbackAdapter', { get: () => false, configurable: true });"""
+"""A page may draw by SwiftShader's adapter as by a GPU's."""
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
 """Key under which WebDriver names an element."""
 
@@ -44,7 +48,7 @@ class Browser:
     """One window with a new, empty profile."""
 
     def __init__(self, profile: Path, webgl: bool = False, webgpu: bool = False) -> None:
-        """``webgpu``: beside WebGL."""
+        """``webgpu``: beside WebGL, on an adapter that passes for a GPU."""
         assert CHROMIUM is not None
         assert DRIVER is not None
         with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -60,6 +64,8 @@ class Browser:
         options = {"goog:chromeOptions": {"binary": CHROMIUM, "args": arguments}}
         said = self._ask("POST", "/session", {"capabilities": {"alwaysMatch": options}})
         self._session = f"/session/{said['sessionId']}"
+        if webgpu:
+            self.before(AS_GPU)
 
     def close(self) -> None:
         self._ask("DELETE", self._session)

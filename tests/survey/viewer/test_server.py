@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import http.client
 import json
+import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -109,7 +110,8 @@ def test_nobody_is_sent_to_another_server(locked: ViewerPage, start: str) -> Non
 
 def test_the_pages_files_are_small_and_sent_again_only_when_they_changed(page: ViewerPage) -> None:
     total = 0
-    for name in ("/", "/client/style.css", "/client/main.js", "/client/draw.js"):
+    start = gzip.decompress(get(page, "/")[1]).decode()
+    for name in ("/", *re.findall(r"/client/[\w.]+", start)):
         status, data, headers = get(page, name)
         assert (status, headers["Content-Encoding"]) == (200, "gzip")
         assert get(page, name, **{"If-None-Match": headers["ETag"]})[:2] == (304, b"")

@@ -12,10 +12,10 @@ const SLOT = 256; // bytes from one uniform to the next in a buffer, as WebGPU h
 const MARGIN = 1.3; // half fields of view beyond which ellipses do not grow; 1 + TANGENT_MARGIN of limits.py
 
 export class WebGpu {
-  // Null where the browser has no WebGPU or no adapter for it.
+  // Null where the browser has no WebGPU, no adapter for it, or one that is a program: WebGL is faster then.
   static async on(canvas) {
     const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
-    if (!adapter) return null;
+    if (!adapter || (adapter.info?.isFallbackAdapter ?? adapter.isFallbackAdapter)) return null;
     const requiredLimits = Object.fromEntries(LIMITS.map(name => [name, adapter.limits[name]]));
     const [device, ...texts] = await Promise.all([adapter.requestDevice({ requiredLimits }),
       ...Object.keys(KERNELS).map(async file => (await asked(`/client/${file}.wgsl`)).text())]);
