@@ -21,6 +21,7 @@ from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE
 from aquaflow.survey.viewer.finished import open_dive
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import seen_water
+from aquaflow.survey.viewer.splats import splats
 from tests.browser import Browser, needs_browser
 from tests.survey.viewer.planes import floor
 
@@ -85,6 +86,23 @@ def flat() -> Iterator[ViewerPage]:
     plane.levels[COVERAGE] = np.where(plane.centres[:, 0] > 0.0, 3, 1).astype(np.uint8)
     water = seen_water([0.5] * 3, [0.0, 0.0, 0.9], [0.5] * 3, [0.0] * 3, [0.5] * 3, [1.0] * 3, 5.0)
     page.show_splats(plane, water, {COVERAGE: CLASSES})
+    look_down(page)
+    yield page
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def near() -> Iterator[ViewerPage]:
+    """Gaussians of sigmas to 4000 px, and one whose middle is 1300 px beside the first pose."""
+    page = ViewerPage(ViewerConfig(port=0), "near", live=False)
+    rotated = [[0.9, 0.1, -0.2, 0.3], [0.8, 0.2, 0.1, -0.4]]
+    places = [[0.0, 0.0, 1.0], [0.5, 0.2, 1.2], [3.0, -0.1, 1.1], [-40, -30, 9], [40, 30, 9]]
+    turns = [[1, 0, 0, 0], *rotated, [1, 0, 0, 0], [1, 0, 0, 0]]
+    scales = [[4.0, 5.0, 0.1], [9.0, 0.1, 0.2], [8.0, 0.2, 0.3], [1, 1, 1], [1, 1, 1]]
+    colours = [[0.5, 0.8, 0.7], [0.9, 0.1, 0.1], [0.1, 0.2, 0.9], [0.5] * 3, [0.5] * 3]
+    opacities = [0.5, 0.7, 0.8, 0.9, 0.9]
+    rows = (np.array(each, np.float32) for each in (places, turns, scales, opacities, colours))
+    page.show_splats(splats(*rows, len(places)))
     look_down(page)
     yield page
     page.close()
@@ -178,6 +196,17 @@ def test_both_draw_the_same_picture(page: ViewerPage, tmp_path: Path) -> None:
             assert drawn_by(browser) == renderer
     for look, expected in pictures["webgl"].items():
         assert_same(pictures["webgpu"][look], expected, look)
+
+
+def test_both_draw_what_is_wider_than_the_screen_alike(near: ViewerPage, tmp_path: Path) -> None:
+    folder = Path(PICTURES) if PICTURES else tmp_path
+    pictures = []
+    for renderer in RENDERERS:
+        with opened(near, tmp_path / renderer, webgpu=renderer == "webgpu") as browser:
+            browser.run(SET, "#pose", 0)
+            pictures.append(still(browser, folder / f"near_{renderer}.png"))
+            assert drawn_by(browser) == renderer
+    assert_same(pictures[1], pictures[0])
 
 
 def test_a_lost_device_is_replaced_by_webgl_on_the_same_page(
