@@ -146,10 +146,11 @@ def drawn_by(browser: Browser) -> str:
 
 def still(browser: Browser, file: Path) -> Picture:
     """[H, W, 3] what is on the screen once the whole map is there and has come to rest."""
-    browser.wait("aquaflowTimes.whole")
+    browser.wait("aquaflowTimes.whole && aquaflowTimes.still")
     before, now = None, shot(browser, file)
     while before is None or not np.array_equal(before, now):
         time.sleep(0.4)
+        browser.wait("aquaflowTimes.still")
         before, now = now, shot(browser, file)
     return now
 

@@ -81,12 +81,18 @@ export class Drawing {
     return Math.min(this.count, Math.max(FEWEST, Math.round(most)));
   }
 
+  // Whether what is on the screen is the last word.
+  get still() { return !this.wanted && !this.late && this.began === null && !this.renderer.sorting; }
+
   get nearest() { return 0.005 * Math.max(...this.about.half); }
 
   // Called once for each picture of the screen.
   turn(eye) {
     if (!this.about || !this.count || this.began !== null && !this.finished()) return;
-    if (!this.wanted) return;
+    if (!this.wanted) {
+      if (this.late) this.paint(); // from where the order was asked for: another one would be late again
+      return;
+    }
     this.wanted = false;
     this.eye = { place: [...eye.place], axes: eye.axes.map(axis => [...axis]) };
     this.optics = eye.optics(this.canvas.clientWidth, this.canvas.clientHeight);
@@ -142,7 +148,6 @@ export class Drawing {
       this.shownAt = performance.now();
       this.wanted = true;
     }
-    if (this.late) this.wanted = true;
     return true;
   }
 }

@@ -18,8 +18,8 @@ let scene = null, drawing = null, looking = false, pathShown = -1, loading = fal
 
 const changed = () => { if (drawing) drawing.wanted = true; };
 // In ms since the address was opened: the script runs, a first chunk is there, a first picture is on
-// the screen, the whole map is drawn.
-const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; } };
+// the screen, the whole map is drawn. And what a Gaussian costs, and whether nothing is left to draw.
+const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; } };
 const drawn = () => {
   marks.camera = line.camera;
   marks.draw(eye);
