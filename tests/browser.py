@@ -28,6 +28,13 @@ FLAGS = (
 )
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """In place of --disable-gpu, where a page draws by WebGL: on the processor."""
+WEBGPU = ("--enable-unsafe-webgpu", "--enable-features=Vulkan", "--use-vulkan=swiftshader")
+"""Besides, where it may draw by WebGPU. With fewer of them there is an adapter too, whose device is
+lost at the first picture."""
+AS_GPU = """
+    if (globalThis.GPUAdapterInfo) Object.defineProperty(
+      GPUAdapterInfo.prototype, 'isFallbackAdapter', { get: () => false, configurable: true });"""
+"""A page may draw by SwiftShader's adapter as by a GPU's."""
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
 """Key under which WebDriver names an element."""
 
@@ -40,7 +47,8 @@ needs_browser = pytest.mark.skipif(
 class Browser:
     """One window with a new, empty profile."""
 
-    def __init__(self, profile: Path, webgl: bool = False) -> None:
+    def __init__(self, profile: Path, webgl: bool = False, webgpu: bool = False) -> None:
+        """``webgpu``: beside WebGL, on an adapter that passes for a GPU."""
         assert CHROMIUM is not None
         assert DRIVER is not None
         with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -49,11 +57,15 @@ class Browser:
             [DRIVER, f"--port={self._port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         self.until(self._is_up, "chromedriver")
-        flags = [flag for flag in FLAGS if not webgl or flag != "--disable-gpu"]
-        arguments = [*flags, *(WEBGL if webgl else ()), f"--user-data-dir={profile}"]
+        draws = webgl or webgpu
+        flags = [flag for flag in FLAGS if not draws or flag != "--disable-gpu"]
+        drawing = (WEBGL if draws else ()) + (WEBGPU if webgpu else ())
+        arguments = [*flags, *drawing, f"--user-data-dir={profile}"]
         options = {"goog:chromeOptions": {"binary": CHROMIUM, "args": arguments}}
         said = self._ask("POST", "/session", {"capabilities": {"alwaysMatch": options}})
         self._session = f"/session/{said['sessionId']}"
+        if webgpu:
+            self.before(AS_GPU)
 
     def close(self) -> None:
         self._ask("DELETE", self._session)
@@ -62,6 +74,10 @@ class Browser:
 
     def open(self, address: str) -> None:
         self._ask("POST", f"{self._session}/url", {"url": address})
+
+    def before(self, script: str) -> None:
+        """Run a script in each page that is opened from now on, before its own."""
+        self._command("Page.addScriptToEvaluateOnNewDocument", {"source": script})
 
     def forget(self) -> None:
         """All cookies, of whatever host and port."""

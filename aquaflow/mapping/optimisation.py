@@ -21,8 +21,9 @@ from aquaflow.mapping.gpu_steps import GpuSteps
 from aquaflow.mapping.neural.decoder import DECODED
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.render.adam import SelectiveAdam
-from aquaflow.render.contract import TILE_PX, active_pixels
+from aquaflow.render.contract import active_pixels
 from aquaflow.render.dense_adam import DenseAdam
+from aquaflow.render.limits import TILE_PX
 from aquaflow.render.photometric import (
     depth_loss,
     outlier_mask,

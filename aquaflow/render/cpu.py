@@ -16,7 +16,6 @@ from torch.utils.checkpoint import checkpoint
 
 from aquaflow.render.contract import (
     CPU,
-    TILE_PX,
     Renderer,
     Rendering,
     check_devices,
@@ -25,6 +24,7 @@ from aquaflow.render.contract import (
     tile_grid,
 )
 from aquaflow.render.library import STAGES, Library, NativeUnavailableError, load_library
+from aquaflow.render.limits import TILE_PX
 from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
 from aquaflow.render.tensor_address import pointer
 

@@ -15,9 +15,6 @@ from torch import Tensor
 
 from aquaflow.base.errors import AquaFlowError, first_line
 from aquaflow.render.contract import (
-    DILATION_PX2,
-    NEAR_PLANE_M,
-    TILE_PX,
     Rendering,
     active_pixels,
     check_devices,
@@ -25,6 +22,7 @@ from aquaflow.render.contract import (
     tile_grid,
     touches_active,
 )
+from aquaflow.render.limits import DILATION_PX2, NEAR_PLANE_M, TILE_PX
 
 OLDEST = (1, 5)
 """The first version with the features used here."""

@@ -14,6 +14,15 @@ from torch import Tensor
 
 from aquaflow.render.contract import (
     CPU,
+    Renderer,
+    Rendering,
+    active_pixels,
+    check_devices,
+    check_inputs,
+    touches_active,
+)
+from aquaflow.render.example_scene import FARTHEST_M, NAMES, SplatScene
+from aquaflow.render.limits import (
     DILATION_PX2,
     MAX_ALPHA,
     MAX_SIGMA_PX,
@@ -23,14 +32,7 @@ from aquaflow.render.contract import (
     NEAR_PLANE_M,
     RADIUS_SIGMAS,
     TANGENT_MARGIN,
-    Renderer,
-    Rendering,
-    active_pixels,
-    check_devices,
-    check_inputs,
-    touches_active,
 )
-from aquaflow.render.example_scene import FARTHEST_M, NAMES, SplatScene
 
 
 @dataclass(frozen=True)

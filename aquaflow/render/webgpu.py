@@ -22,7 +22,6 @@ from torch.autograd.function import once_differentiable
 from aquaflow.base.errors import AquaFlowError, first_line
 from aquaflow.render.contract import (
     CPU,
-    TANGENT_MARGIN,
     Renderer,
     Rendering,
     check_devices,
@@ -30,6 +29,7 @@ from aquaflow.render.contract import (
     tile_grid,
 )
 from aquaflow.render.cpu import Lease, cpu_renderer
+from aquaflow.render.limits import TANGENT_MARGIN
 from aquaflow.render.webgpu_device import missing, shared_device
 from aquaflow.render.webgpu_drawing import COLOURS, MEAN, OPACITY, QUAT, ROW, SCALES, Drawing
 

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import AquaFlowError, first_line
-from aquaflow.render import adam, contract, photometric, water
+from aquaflow.render import adam, contract, photometric, water, wgsl
 from aquaflow.render.transfer_counts import COUNTS
 
-FOLDER = Path(__file__).parent / "wgsl"
-"""Where the kernels are."""
 MOMENTS = 10
 """Sums of a hit that its gradient follows from; see blend_backward.wgsl."""
 CHUNK = 4
@@ -178,7 +176,7 @@ class Device:
         """
         if name not in self._pipelines:
             if file not in self._modules:
-                code = _read_source(file)
+                code = wgsl.source(file, _constants())
                 self._modules[file] = self.device.create_shader_module(code=code, label=file)
             compute = {"module": self._modules[file], "entry_point": name}
             pipeline = self.device.create_compute_pipeline(layout="auto", compute=compute)
@@ -238,54 +236,24 @@ def shared_device() -> Device:
     return Device()
 
 
-_PARTS = {
-    "project": ("numbers", "camera", "footprint", "reach"),
-    "hits": ("camera", "reach", "scan"),
-    "ranges": ("camera",),
-    "blend": ("camera",),
-    "blend_backward": ("camera",),
-    "project_backward": ("camera", "footprint", "add_up"),
-    "sort": (),
-    "sum": ("scan",),
-    "activate": ("step", "add_up"),
-    "compose": ("numbers", "step"),
-    "loss": ("step",),
-    "compose_backward": ("step", "add_up"),
-    "adam": ("numbers", "step"),
-    "reduce": ("add_up",),
-}
-"""Files that come before each file of kernels: WGSL has no include."""
-
-
-def _read_source(file: str) -> str:
-    texts = [(FOLDER / f"{part}.wgsl").read_text() for part in (*_PARTS[file], file)]
-    return "\n".join([_constants(), *texts])
-
-
-def _constants() -> str:
-    """The constants of the definitions in torch, as WGSL."""
-    floats = {
-        "LOG2_MIN_ALPHA": math.log2(contract.MIN_ALPHA),
-        "LOG2E": math.log2(math.e),
-        "LN2": math.log(2.0),
+@cache
+def _constants() -> dict[str, float | int]:
+    """The constants of the definitions in torch."""
+    found: dict[str, float | int] = {
         "SSIM_TAPS": sum(
             math.exp(-(k * k) / (2.0 * photometric.SSIM_SIGMA_PX**2))
             for k in range(-(photometric.SSIM_WINDOW // 2), photometric.SSIM_WINDOW // 2 + 1)
         ),
+        "MOMENTS": MOMENTS,
+        "CHUNK": CHUNK,
     }
     for module, names in _NAMES.items():
-        floats |= {name: getattr(module, name) for name in names}
-    whole = {"TILE_PX": contract.TILE_PX, "MOMENTS": MOMENTS, "CHUNK": CHUNK}
-    lines = [f"const {name}: f32 = {value:.9g};" for name, value in floats.items()]
-    lines += [f"const {name}: u32 = {value};" for name, value in whole.items()]
-    return "\n".join(lines)
+        found |= {name: getattr(module, name) for name in names}
+    return found
 
 
 _NAMES: dict[Any, tuple[str, ...]] = {
-    contract: (
-        *("DILATION_PX2", "MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE", "NEAR_PLANE_M"),
-        *("MIN_QUAT_NORM_SQ", "MAX_SIGMA_PX", "RADIUS_SIGMAS", "COLOUR_SHARPNESS"),
-    ),
+    contract: ("COLOUR_SHARPNESS",),
     photometric: (
         *("SSIM_SIGMA_PX", "SSIM_C1", "SSIM_C2", "MIN_RANGE", "SOLID", "RADIAL_VARIANCE"),
     ),

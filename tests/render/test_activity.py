@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.render.contract import TILE_PX, active_pixels, tile_grid, touches_active
+from aquaflow.render.contract import active_pixels, tile_grid, touches_active
 from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.limits import TILE_PX
 from aquaflow.render.native import build as native
 from tests.render.render_scenes import (
     HEIGHT,

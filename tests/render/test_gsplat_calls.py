@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from aquaflow.render import gsplat as ours
-from aquaflow.render.contract import CPU, MIN_ALPHA, TILE_PX, Rendering, active_pixels, tile_grid
+from aquaflow.render.contract import CPU, Rendering, active_pixels, tile_grid
 from aquaflow.render.example_scene import SMALL, height_field
+from aquaflow.render.limits import MIN_ALPHA, TILE_PX
 from aquaflow.render.reference import alpha_at, blend_weights, differences, too_far
 from tests.render.render_scenes import (
     HEIGHT,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.render import contract
+from aquaflow.render import limits
 from aquaflow.render.contract import Rendering
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.library import STAGES, load_library
@@ -162,7 +162,7 @@ def test_opacity_one_draws_at_the_clamp_and_takes_no_gradient_there(kind: str) -
     scene = random_scene(9, n=1)
     scene = replace(scene, opacities=torch.ones(1), scales=torch.full((1, 3), 5.0))
     out, gradients = draw_and_differentiate(make(kind), scene)
-    assert out.alpha.max().item() == pytest.approx(contract.MAX_ALPHA, abs=1e-6)
+    assert out.alpha.max().item() == pytest.approx(limits.MAX_ALPHA, abs=1e-6)
     assert all(gradient.isfinite().all() for gradient in gradients)
 
 
@@ -265,16 +265,16 @@ def test_loading_the_library_keeps_denormal_numbers() -> None:
 @pytest.mark.parametrize("isa", native.supported_isas())
 def test_native_constants_mirror_the_contract(isa: str) -> None:
     wanted = [
-        contract.DILATION_PX2,
-        contract.MAX_ALPHA,
-        contract.MIN_ALPHA,
-        contract.MIN_TRANSMITTANCE,
-        contract.NEAR_PLANE_M,
-        contract.TANGENT_MARGIN,
-        contract.MIN_QUAT_NORM_SQ,
-        contract.MAX_SIGMA_PX,
-        contract.RADIUS_SIGMAS,
-        contract.TILE_PX,
+        limits.DILATION_PX2,
+        limits.MAX_ALPHA,
+        limits.MIN_ALPHA,
+        limits.MIN_TRANSMITTANCE,
+        limits.NEAR_PLANE_M,
+        limits.TANGENT_MARGIN,
+        limits.MIN_QUAT_NORM_SQ,
+        limits.MAX_SIGMA_PX,
+        limits.RADIUS_SIGMAS,
+        limits.TILE_PX,
     ]
     assert load_library(isa).constants() == pytest.approx(wanted, rel=1e-6)
 

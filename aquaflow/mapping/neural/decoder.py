@@ -23,9 +23,9 @@ from torch.nn import functional as F
 from aquaflow.config.mapping import DecoderConfig
 from aquaflow.mapping.gaussians import quaternion_product
 from aquaflow.mapping.neural.voxel_groups import EMPTY, VoxelGroups
-from aquaflow.render.contract import NEAR_PLANE_M
 from aquaflow.render.decoding import ViewWeights, decode_view, takes
 from aquaflow.render.library import library_or_none
+from aquaflow.render.limits import NEAR_PLANE_M
 from aquaflow.render.transfers import groups_in, groups_out
 from aquaflow.render.views import View
 from aquaflow.render.water import BANDS, sinusoidal_encoding

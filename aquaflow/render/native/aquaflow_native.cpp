@@ -71,7 +71,7 @@ extern "C" {
 AQ_EXPORT extern const char aq_source_hash[];
 __attribute__((used)) const char aq_source_hash[] = "aquaflow-source:" AQ_SOURCE_HASH;
 
-// Mirrored by contract.py; order as in library.py.
+// Mirrored by limits.py; order as in library.py.
 AQ_EXPORT void aq_constants(double* out) {
   const double all[] = {kDilationPx2,   kMaxAlpha,      kMinAlpha,   kMinTransmittance, kNearPlane,
                         kTangentMargin, kMinQuatNormSq, kMaxSigmaPx, kRadiusSigmas,     kTile};

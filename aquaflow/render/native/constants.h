@@ -1,4 +1,4 @@
-// Constants of the splatting model, mirrored in aquaflow/render/contract.py; a test compares the
+// Constants of the splatting model, mirrored in aquaflow/render/limits.py; a test compares the
 // two.
 #pragma once
 

@@ -1,5 +1,5 @@
 // What all kernels of a drawing share: the camera, and which Gaussian has which numbers. The
-// constants in capitals are written before this file by kernels.py, from contract.py.
+// constants in capitals are written before this file by __init__.py, from limits.py.
 
 struct Camera {
   rows: array<vec4f, 3>,  // world to camera: t = rows . (x, 1)

@@ -39,9 +39,15 @@ MOMENTS = np.array([[0.0, 4.2, 271.6, 0, 0.0], [75.0, np.nan, 90.0, 0, 0.0]], np
 Box = tuple[float, float, float, float]
 
 
+@pytest.fixture(scope="module", params=[False, True], ids=["webgl", "webgpu"])
+def webgpu(request: pytest.FixtureRequest) -> bool:
+    """Whether the browser has WebGPU beside WebGL."""
+    return bool(request.param)
+
+
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    browser = Browser(tmp_path_factory.mktemp("profile"), webgl=True)
+def browser(tmp_path_factory: pytest.TempPathFactory, webgpu: bool) -> Iterator[Browser]:
+    browser = Browser(tmp_path_factory.mktemp("profile"), webgl=True, webgpu=webgpu)
     yield browser
     browser.close()
 
@@ -73,9 +79,9 @@ def shown(browser: Browser, page: ViewerPage) -> Browser:
 
 
 @pytest.fixture
-def touched(page: ViewerPage, tmp_path: Path) -> Iterator[Browser]:
+def touched(page: ViewerPage, tmp_path: Path, webgpu: bool) -> Iterator[Browser]:
     """A browser of its own: Chromium that leaves a page it had touched may lose later touches."""
-    browser = Browser(tmp_path / "profile", webgl=True)
+    browser = Browser(tmp_path / "profile", webgl=True, webgpu=webgpu)
     try:
         show(browser, page, TABLET)
         yield browser
@@ -120,6 +126,11 @@ def until(browser: Browser, x: float, y: float, tmp_path: Path, wanted: str) -> 
     return found
 
 
+def drawn_by_webgpu(browser: Browser) -> bool:
+    """A canvas has one kind of context, and gives no other."""
+    return bool(browser.run("return document.querySelector('#map').getContext('webgpu') !== null"))
+
+
 def box(browser: Browser, selector: str) -> Box:
     said = browser.run(
         "const r = document.querySelector(arguments[0]).getBoundingClientRect();"
@@ -144,6 +155,10 @@ def point(browser: Browser, x: float, y: float, count: int) -> None:
     left, top, width, height = box(browser, "#map")
     browser.tap(left + x * width, top + y * height)
     browser.wait(f"Number(document.querySelector('#tools').dataset.points) === {count}")
+
+
+def test_the_map_is_drawn_by_webgpu_where_the_browser_has_it(shown: Browser, webgpu: bool) -> None:
+    assert drawn_by_webgpu(shown) == webgpu
 
 
 def test_the_map_is_drawn_and_water_comes_by_its_slider(shown: Browser, tmp_path: Path) -> None:

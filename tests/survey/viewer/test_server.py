@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import http.client
 import json
+import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.service import ViewerConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.render import wgsl
 from aquaflow.survey.viewer.page import MOST_BYTES, ViewerPage
 from tests.survey.viewer.planes import floor
 
@@ -108,12 +110,21 @@ def test_nobody_is_sent_to_another_server(locked: ViewerPage, start: str) -> Non
 
 def test_the_pages_files_are_small_and_sent_again_only_when_they_changed(page: ViewerPage) -> None:
     total = 0
-    for name in ("/", "/client/style.css", "/client/main.js", "/client/draw.js"):
+    start = gzip.decompress(get(page, "/")[1]).decode()
+    for name in ("/", *re.findall(r"/client/[\w.]+", start)):
         status, data, headers = get(page, name)
         assert (status, headers["Content-Encoding"]) == (200, "gzip")
         assert get(page, name, **{"If-None-Match": headers["ETag"]})[:2] == (304, b"")
         total += len(data)
     assert total < 30_000
+
+
+def test_the_page_gets_the_kernels_that_maps_are_optimised_with(page: ViewerPage) -> None:
+    for name in ("project", "sort", "sum"):
+        status, data, headers = get(page, f"/client/{name}.wgsl")
+        kernels = (Path(wgsl.__file__).parent / f"{name}.wgsl").read_text()
+        assert (status, headers["Content-Type"]) == (200, "text/plain; charset=utf-8")
+        assert gzip.decompress(data).decode().endswith(kernels)
 
 
 def test_a_chunk_is_kept_by_the_browser_and_another_map_has_another_address(

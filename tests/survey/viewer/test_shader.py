@@ -57,9 +57,31 @@ class Vector(np.ndarray[Any, Any]):
     z = property(lambda self: self[2])
 
 
-def drawn(clear: Array, z: float, seen: SeenWater, water: float = 1.0) -> Array:
+def as_glsl(text: str) -> str:
+    """Functions of WGSL that are made of float and vec3 in the other shader's words."""
+    renamed = (
+        *(("side.", ""), ("vec3f", "vec3"), ("f32", "float"), ("B_inf", "Binf"), ("B_res", "Bres")),
+        *(("shown_compression", "shownCompression"), ("through_water", "throughWater")),
+    )
+    for word, other in renamed:
+        text = text.replace(word, other)
+    text = re.sub(r"(\w+): (vec3|float)\b", r"\2 \1", text)
+    text = re.sub(r"^fn (\w+\(.*\)) -> vec3 ", r"vec3 \1 ", text, flags=re.MULTILINE)
+    return text.replace("; let ", ", ").replace("let ", "vec3 ")
+
+
+SHADERS = {"shaders.js": str, "splats.wgsl": as_glsl}
+"""Of WebGL and of WebGPU."""
+
+
+@pytest.fixture(params=SHADERS)
+def shader(request: pytest.FixtureRequest) -> str:
+    text = Path(client.__file__).with_name(request.param).read_text()
+    return str(SHADERS[request.param](text))
+
+
+def drawn(text: str, clear: Array, z: float, seen: SeenWater, water: float = 1.0) -> Array:
     """The colour that the shader gives a Gaussian of this colour at range z."""
-    text = Path(client.__file__).with_name("shaders.js").read_text()
     part = {
         "beta": seen.beta, "Binf": seen.B_inf, "b": seen.b, "Bres": seen.B_res, "d": seen.d,
         "gain": seen.gain, "white": seen.white, "lamp": seen.lamp,
@@ -88,7 +110,9 @@ def seen_by(lamp: Lamp | None) -> SeenWater:
 
 
 @pytest.mark.parametrize("lamp", [None, LAMP])
-def test_through_the_water_a_browser_shows_what_the_renderer_does(lamp: Lamp | None) -> None:
+def test_through_the_water_a_browser_shows_what_the_renderer_does(
+    shader: str, lamp: Lamp | None
+) -> None:
     of = [torch.tensor(each, dtype=torch.float64) for each in (BETA, B_INF, B, B_RES, D)]
     water = WaterParameters(*of, lamp)
     clear = np.asarray(TONE.of(np.array(GAIN) * J))
@@ -96,11 +120,17 @@ def test_through_the_water_a_browser_shows_what_the_renderer_does(lamp: Lamp | N
         at = torch.tensor([z], dtype=torch.float64)
         rendered = torch.tensor(J) * water.transmission(at)[0] + water.backscatter(at)[0]
         # The renderer's exponents end at MAX_OPTICAL_DEPTH.
-        np.testing.assert_allclose(drawn(clear, z, seen_by(lamp)), rendered.numpy(), atol=1e-5)
+        np.testing.assert_allclose(
+            drawn(shader, clear, z, seen_by(lamp)), rendered.numpy(), atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("lamp", [None, LAMP])
-def test_without_water_a_browser_shows_the_colours_that_it_got(lamp: Lamp | None) -> None:
+def test_without_water_a_browser_shows_the_colours_that_it_got(
+    shader: str, lamp: Lamp | None
+) -> None:
     clear = np.asarray(TONE.of(np.array(GAIN) * J))
     for z in RANGES:
-        np.testing.assert_allclose(drawn(clear, z, seen_by(lamp), water=0.0), clear, rtol=1e-9)
+        np.testing.assert_allclose(
+            drawn(shader, clear, z, seen_by(lamp), water=0.0), clear, rtol=1e-9
+        )

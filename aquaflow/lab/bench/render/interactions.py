@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import torch
 
-from aquaflow.render.contract import TILE_PX
 from aquaflow.render.example_scene import SplatScene
+from aquaflow.render.limits import TILE_PX
 from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
 
 FORWARD_FLOP, BACKWARD_FLOP = 30.0, 56.0

@@ -20,7 +20,8 @@ from aquaflow.dive.map_file import splats_of
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
-from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
+from aquaflow.render.contract import Renderer
+from aquaflow.render.limits import RADIUS_SIGMAS
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
 from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground

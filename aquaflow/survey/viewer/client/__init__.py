@@ -8,14 +8,19 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
+from aquaflow.render import wgsl
+
 KINDS = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
     "js": "text/javascript; charset=utf-8",
+    "wgsl": "text/plain; charset=utf-8",
 }
 """Content types by suffix."""
 START = "index.html"
 """The one at / as well."""
+SHARED = ("project", "sort", "sum")
+"""The renderer's kernels that the page draws with (client/webgpu.js)."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +43,14 @@ def client_file(path: str) -> ClientFile | None:
 @cache
 def _files() -> dict[str, ClientFile]:
     """By name; read once, so that a request reads no path that a client wrote."""
-    found = {}
+    texts = {f"{name}.wgsl": wgsl.source(name) for name in SHARED}
     for entry in resources.files(__name__).iterdir():
-        kind = KINDS.get(entry.name.rpartition(".")[2])
-        if kind is not None:
-            data = entry.read_bytes()
-            tag = f'"{hashlib.blake2b(data, digest_size=8).hexdigest()}"'
-            found[entry.name] = ClientFile(kind, gzip.compress(data, mtime=0), tag)
-    return found
+        if entry.name.rpartition(".")[2] in KINDS:
+            before = wgsl.preamble("camera") if entry.name.endswith(".wgsl") else ""
+            texts[entry.name] = before + entry.read_text("utf-8")
+    return {name: _packed(name, text.encode()) for name, text in texts.items()}
+
+
+def _packed(name: str, data: bytes) -> ClientFile:
+    tag = f'"{hashlib.blake2b(data, digest_size=8).hexdigest()}"'
+    return ClientFile(KINDS[name.rpartition(".")[2]], gzip.compress(data, mtime=0), tag)

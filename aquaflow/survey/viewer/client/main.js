@@ -18,8 +18,8 @@ let scene = null, drawing = null, looking = false, pathShown = -1, loading = fal
 
 const changed = () => { if (drawing) drawing.wanted = true; };
 // In ms since the address was opened: the script runs, a first chunk is there, a first picture is on
-// the screen, the whole map is drawn.
-const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; } };
+// the screen, the whole map is drawn. And what a Gaussian costs, and whether nothing is left to draw.
+const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; } };
 const drawn = () => {
   marks.camera = line.camera;
   marks.draw(eye);
@@ -91,7 +91,7 @@ async function update() {
   await showPath(scene.path);
   line.setScene(scene);
   if (!scene.map) { say("There is no map yet."); return; }
-  if (!drawing) begin();
+  if (!drawing) await begin();
   looks.offer(scene.map, scene.unit, scene.metres);
   if (!looking) { looking = true; home(); }
   const done = due && showMap(scene.map, coming).catch(error => say(error.message));
@@ -99,8 +99,8 @@ async function update() {
   say("");
 }
 
-function begin() {
-  drawing = new Drawing(find("map"), drawn);
+async function begin() {
+  drawing = await Drawing.on(find("map"), drawn);
   looks.begin(drawing, divider(find("divider"), find("view"), share => { drawing.look.wipe = looks.wiping ? share : null; changed(); }));
   tools.offer(scene.can);
   const turn = () => { drawing.turn(eye); requestAnimationFrame(turn); };

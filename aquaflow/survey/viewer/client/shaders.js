@@ -61,15 +61,15 @@ void main() {
   M = mat3(M[0] * scale.x, M[1] * scale.y, M[2] * scale.z);
   vec3 jx = vec3(focal.x, 0.0, -focal.x * slope.x) / t.z, jy = vec3(0.0, focal.y, -focal.y * slope.y) / t.z;
   vec3 mx = jx * M, my = jy * M;
+  vec3 normal = cross(mx, my);
   float xx = dot(mx, mx) + 0.3, xy = dot(mx, my), yy = dot(my, my) + 0.3;
-  float mean = 0.5 * (xx + yy), apart = length(vec2(0.5 * (xx - yy), xy));
-  float major = mean + apart, minor = max(mean - apart, 0.1);
+  if (0.5 * (xx + yy) + length(vec2(0.5 * (xx - yy), xy)) >= 1e10) return; // MAX_SIGMA_PX of limits.py
+  float det = dot(normal, normal) + 0.3 * (xx + yy - 0.3); // by Cauchy-Binet: no cancellation for needles
   float alpha = second.y / 255.0;
   float reach = sqrt(2.0 * log(max(255.0 * alpha, 1.0)));
   if (reach <= 0.0) return;
-  vec2 along = abs(xy) < 1e-6 ? (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0)) : normalize(vec2(xy, major - xx));
   at = corner * reach;
-  vec2 px = min(sqrt(major), 1024.0) * at.x * along + min(sqrt(minor), 1024.0) * at.y * vec2(-along.y, along.x);
+  vec2 px = sqrt(xx) * at.x * vec2(1.0, xy / xx) + vec2(0.0, sqrt(det / xx) * at.y); // by the covariance's root, as splats.wgsl
   vec2 pixel = centre + focal * t.xy / t.z + px;
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
   vec3 clear = vec3(second.zw, bytes(one.w).x) / 255.0 * brightest;

@@ -34,6 +34,6 @@ onmessage = ({ data }) => {
   else if (data.places) places.set(data.places, 3 * data.first);
   else {
     const order = sorted(data);
-    postMessage({ order, map: data.map }, [order.buffer]);
+    postMessage(order, [order.buffer]);
   }
 };

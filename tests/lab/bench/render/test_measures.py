@@ -20,8 +20,8 @@ from aquaflow.lab.bench.render.interactions import count_interactions
 from aquaflow.lab.bench.render.parts import parts_of, time_parts
 from aquaflow.lab.bench.render.rows import row_of
 from aquaflow.lab.bench.render.timing import Sample, interleave, time_renderer
-from aquaflow.render.contract import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from aquaflow.render.example_scene import Size, height_field
+from aquaflow.render.limits import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from aquaflow.render.native.build import supported_isas
 from aquaflow.render.reference import ReferenceRenderer, project
 from tests.lab.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
