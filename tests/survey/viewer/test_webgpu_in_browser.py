@@ -32,6 +32,8 @@ PICTURES = os.environ.get("AQUAFLOW_PAGE_PICTURES")
 RENDERERS = ("webgl", "webgpu")
 SMALL = 3
 """Grey levels: each of some 30 layers is rounded to 8 bits."""
+NO_HASTE = "performance.now = () => 1;"
+"""A slow machine leaves no Gaussians out."""
 KEEP_DEVICE = """
     const ask = GPUAdapter.prototype.requestDevice;
     GPUAdapter.prototype.requestDevice = async function (...given) {
@@ -128,7 +130,7 @@ def opened(page: ViewerPage, profile: Path, *before: str, webgpu: bool = True) -
     browser = Browser(profile, webgl=True, webgpu=webgpu)
     try:
         browser.emulate(800, 500)
-        for script in before:
+        for script in (NO_HASTE, *before):
             browser.before(script)
         browser.open(page.address)
         browser.wait("window.aquaflowTimes?.first")
