@@ -53,7 +53,10 @@ WhiteBalanceOption = Annotated[
     ),
 ]
 
-PRESETS = "fast | balanced | accurate | onboard-gpu | paper; the last two never measured on a GPU"
+PRESETS = (
+    "fast | balanced | accurate | onboard-gpu | paper | paper-strict; "
+    "the last three never measured on a GPU"
+)
 """Help of --preset; a test holds it to the presets that there are."""
 
 

@@ -105,12 +105,23 @@ class InsertionConfig(StageConfig):
         True, description="False: structure and colours of new Gaussians from the raw picture"
     )
     sigma_px: Lab[float] = Field(1.0, gt=0, description="sigma of the Laplacian of Gaussian")
+    norm: Lab[Literal["l1", "l2"]] = Field(
+        "l1", description="of the Laplacian's response over the three colours; l2: the paper"
+    )
+    gain: Lab[float] = Field(
+        3.0, gt=0, description="of the response, before it is cut off at 1; the paper: none, 1"
+    )
+    averaged: Lab[bool] = Field(
+        True,
+        description="the response is averaged over the operator's own width, so that both sides of "
+        "an edge count and not the zero crossing on it; False: pixel by pixel (the paper)",
+    )
     tau_a: Lab[float] = Field(
         0.02,
         ge=0,
         le=1,
-        description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
-        "never fires (docs/paper.md#deviations-mapping)",
+        description="P_a above which a pixel may get a Gaussian; the paper's 1.0 never fires "
+        "(docs/paper.md#tau-a)",
     )
     selection: Lab[Literal["random", "threshold"]] = Field(
         "random",

@@ -281,6 +281,11 @@ class TrackingConfig(StageConfig):
         description="s; in a crowded place another keyframe is looked for so often at most; 0: at "
         "every frame, and the reef swum there and back takes 140 instead of 60 ms a frame there",
     )
+    judge_hidden: Lab[bool] = Field(
+        True,
+        description="what hides the scene makes no keyframe and no mapping frame; False: few "
+        "matches always make a keyframe (the paper)",
+    )
     mapping_parallax_widths: Lab[float] = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
     )

@@ -142,8 +142,8 @@ def raw_colour(
 # --------------------------------------------------------------------------------------------------
 # Medium-guided insertion: where new Gaussians go, and how they start (paper, Eq. 16 and 17).
 
-LOG_GAIN = 3.0
-"""A Laplacian-of-Gaussian response, L1 over RGB, of 1 / LOG_GAIN counts as certain structure."""
+NORMS = {"l1": 1, "l2": 2}
+"""Orders of the norms that the config names."""
 COVERED_ALPHA = 0.6
 """Alpha from which the map covers a pixel."""
 SCALE_OF_SPACING = 0.6
@@ -214,17 +214,18 @@ def colour_range(
 
 def structure(
     image: Tensor,  # [H, W, 3]
-    sigma_px: float,
+    config: InsertionConfig,
 ) -> Tensor:
     """min(|LoG * image|, 1) [H, W]: how much fine structure a pixel belongs to.
 
-    The operator is scale-normalised by sigma^2; its response is averaged over the kernel's own
-    width, so that both sides of an edge count and not the zero crossing on it.
+    The operator is scale-normalised by sigma^2.
     """
-    smooth = cv2.GaussianBlur(picture_out(image), (0, 0), sigma_px)
-    response = np.abs(cv2.Laplacian(smooth, cv2.CV_32F)).sum(axis=-1) * sigma_px**2
-    response = cv2.GaussianBlur(response, (0, 0), 2.0 * sigma_px)
-    return insertion_in(torch.from_numpy(np.clip(LOG_GAIN * response, 0.0, 1.0)), image.device)
+    sigma = config.sigma_px
+    response = cv2.Laplacian(cv2.GaussianBlur(picture_out(image), (0, 0), sigma), cv2.CV_32F)
+    strength = config.gain * sigma**2 * np.linalg.norm(response, NORMS[config.norm], axis=-1)
+    if config.averaged:
+        strength = cv2.GaussianBlur(strength, (0, 0), 2.0 * sigma)
+    return insertion_in(torch.from_numpy(np.clip(strength, 0.0, 1.0)), image.device)
 
 
 def insertion_probability(
@@ -237,7 +238,7 @@ def insertion_probability(
 
     Smooth sand has no Laplacian, but it needs a few large Gaussians all the same.
     """
-    P = structure(restored, config.sigma_px) - structure(rendered, config.sigma_px)
+    P = structure(restored, config) - structure(rendered, config)
     bare = torch.where(alpha < COVERED_ALPHA, config.bare_probability, 0.0)
     return torch.maximum(P.clamp_min(0.0), bare)
 

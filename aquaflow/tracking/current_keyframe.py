@@ -196,8 +196,8 @@ class KeyframeTracker:
         return again
 
     def is_hidden(self, solved: Matched) -> bool:
-        """True if something in front of the scene hides the matches."""
-        return solved.visibility.seen < MIN_SEEN
+        """True if something in front of the scene hides the matches, where that is judged."""
+        return self._config.judge_hidden and solved.visibility.seen < MIN_SEEN
 
     def classify(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> FrameClass:
         """The paper's rules, keyframe by matched share and mapping frame by parallax; but what is

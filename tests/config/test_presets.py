@@ -12,7 +12,7 @@ from aquaflow.config import Config, parse_config
 from aquaflow.config.presets import BY_EFFORT, PRESETS, load_configured, merge, preset
 from aquaflow.config.vehicle import load_vehicle
 
-ON_A_GPU = ("onboard-gpu", "paper")
+ON_A_GPU = ("onboard-gpu", "paper", "paper-strict")
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
@@ -37,18 +37,6 @@ def test_every_preset_is_in_the_help_and_those_never_measured_say_so() -> None:
     listed, _, said = PRESETS_IN_HELP.partition(";")
     assert listed.split(" | ") == list(PRESETS)
     assert "never measured on a GPU" in said
-
-
-def test_the_paper_is_switched_on_by_its_preset() -> None:
-    found = load_configured(None, "paper", {}, "test").mapping
-    assert found.medium.directional
-    assert found.insertion.selection == "threshold"
-    assert found.insertion.colour_range == "rendered"
-    assert found.decoder.enabled
-    assert found.decoder.observation == "before_attention"
-    assert not found.decoder.optimise_initial
-    assert (found.decoder.voxels.size_m, found.decoder.voxels.capacity) == (0.2, 32)
-    assert 600_000 <= found.max_gaussians <= 1_200_000
 
 
 def test_a_learned_prior_of_ones_own_stays_under_a_preset_for_a_gpu(tmp_path: Path) -> None:

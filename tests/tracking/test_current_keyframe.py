@@ -62,6 +62,13 @@ def test_what_is_hidden_in_plain_view_makes_no_keyframe() -> None:
     assert error_share(result.tracked, poses) < 0.01
 
 
+def test_the_paper_makes_a_keyframe_of_what_is_hidden() -> None:
+    poses = path(16, step=0.02)
+    config = QUICK.model_copy(update={"judge_hidden": False})
+    made = run(snowed(poses, SNOWED).frames(SMALL), config, snowed(poses, SNOWED)).store.keyframes
+    assert {k.frame_index for k in made} & set(SNOWED)
+
+
 def test_of_a_hidden_picture_the_map_gets_what_agrees_and_of_a_clear_one_everything() -> None:
     poses = path(16, step=0.02)
     prior = snowed(poses, SNOWED)

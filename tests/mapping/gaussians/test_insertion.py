@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -25,6 +26,8 @@ from tests.mapping.mapping_scenes import CAMERA, pose, view_of
 
 SIZE = (CAMERA.height, CAMERA.width)
 CONFIG = InsertionConfig()
+PRINTED = InsertionConfig(norm="l2", gain=1.0, averaged=False)
+"""Eq. 17 of the paper, as it is printed."""
 FLAT = torch.full((*SIZE, 3), 0.4)
 EDGE = FLAT.clone()
 EDGE[:, 32:] = 0.8
@@ -89,9 +92,35 @@ def test_the_map_covers_from_the_configured_alpha_on() -> None:
 
 def test_structure_saturates_at_one_and_is_never_negative() -> None:
     board = 2.0 * ((torch.arange(SIZE[0])[:, None] + torch.arange(SIZE[1])[None]) % 2).float()
-    wild = structure(board[..., None].repeat(1, 1, 3), sigma_px=0.6)
+    wild = structure(board[..., None].repeat(1, 1, 3), InsertionConfig(sigma_px=0.6))
     assert float(wild.max()) == 1.0
     assert float(wild.min()) >= 0.0
+
+
+def test_the_papers_operator_is_the_euclidean_norm_of_the_laplacian_pixel_by_pixel() -> None:
+    seen = structure(EDGE, PRINTED)[24]
+    smooth = cv2.GaussianBlur(EDGE.numpy(), (0, 0), PRINTED.sigma_px)
+    response = cv2.Laplacian(smooth, cv2.CV_32F)[24]
+    torch.testing.assert_close(seen, torch.from_numpy(np.sqrt((response**2).sum(axis=-1))))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "share"), [("norm", "l1", math.sqrt(3.0)), ("gain", 3.0, 3.0)]
+)
+def test_norm_and_gain_of_a_grey_edge_raise_its_response_by_what_they_say(
+    key: str, value: object, share: float
+) -> None:
+    ours = PRINTED.model_copy(update={key: value})
+    torch.testing.assert_close(structure(EDGE, ours), share * structure(EDGE, PRINTED))
+
+
+def test_only_averaged_does_the_zero_crossing_on_an_edge_count_as_structure() -> None:
+    ramp = torch.linspace(0.0, 1.0, 5)[None, :, None].expand(SIZE[0], 5, 3)
+    edge = torch.cat([torch.zeros(SIZE[0], 30, 3), ramp, torch.ones(SIZE[0], 29, 3)], dim=1)
+    averaged = structure(edge, PRINTED.model_copy(update={"averaged": True}))
+    printed = structure(edge, PRINTED)
+    assert float(printed[24, 32]) < 1e-4 < 0.1 * float(printed[24].max())
+    assert float(averaged[24, 32]) > 0.5 * float(averaged[24].max())
 
 
 # --- selection ------------------------------------------------------------------------------------
