@@ -10,6 +10,7 @@
 
 #include "constants.h"
 #include "pool.h"
+#include "row_ring.h"
 
 namespace aq {
 
