@@ -92,6 +92,7 @@ def test_an_interrupt_keeps_its_exit_code_and_says_what_stays(failing: Cli) -> N
 def test_an_interrupt_while_the_command_is_loaded_says_nothing() -> None:
     pressed = (
         "import os, signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in a background
         "class Press:\n"
         "    def find_spec(self, name, *_):\n"
         "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"

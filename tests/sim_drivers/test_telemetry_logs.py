@@ -101,7 +101,7 @@ def test_a_tlog_whose_clock_was_set_gives_no_utc(tmp_path: Path, set_to_us: int)
     stamps = [BEGAN_US, BEGAN_US + 1_000_000, set_to_us, set_to_us + 1_000_000]
     log = tlog_of(tmp_path / "a.tlog", stamps)
     assert list(log.samples()) == []
-    assert log.notes == ["the clock of a.tlog was set 1 times and gives no UTC"]
+    assert log.notes == ["the clock of a.tlog was set once and gives no UTC"]
 
 
 def test_a_tlog_from_a_computer_without_a_clock_gives_no_utc(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def test_usual_pictures_are_not_odd() -> None:
         ([np.full((96, 96, 3), 252, np.uint8)] * 5, "nearly white"),
         ([SCENE] * 5, "nothing moves"),
         ([each for each in moving(SCENE) for _ in range(3)], "repeat the one before"),
-        (moving(SCENE) + moving(OTHER), "changes from one picture to the next 1 times"),
+        (moving(SCENE) + moving(OTHER), "changes from one picture to the next once"),
     ],
 )
 def test_what_is_odd_is_named(pictures: Pictures, words: str) -> None:

@@ -43,7 +43,7 @@ def test_a_replay_that_was_cut_off_is_to_be_mapped_again(tmp_path: Path) -> None
     dive = dive_in(tmp_path, DiveStatus(DiveState.OPEN), {"complete": True})
     said = unfinished_reason(dive) or ""
     assert f"{dive} is not finished" in said
-    assert f"`aquaflow map RECORDING --out {dive} --overwrite`" in said
+    assert f"`aquaflow map RECORDING --out {dive}`" in said
     with pytest.raises(InputError, match="is not finished"):
         refuse_without_map(dive)
 
