@@ -12,10 +12,10 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from aquaflow.base.errors import InputError
-from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
 from aquaflow.survey.export.ortho.grid import Grid
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
+from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.survey.measure.height_field import Array, Counts, HeightField, Held
 from aquaflow.water.sightings import SOLID
@@ -42,7 +42,7 @@ MOST_CELLS = 1 << 22
 
 
 def draw_heights(
-    mapper: Mapper,
+    shown: ShownViews,
     ground: Ground,
     work: Path,
     cell: float | None = None,
@@ -58,8 +58,9 @@ def draw_heights(
         InputError: the views show nothing, the cells would be too many, or ``work`` cannot be
             written to.
     """
+    mapper = shown.mapper
     ranges = ViewRanges(mapper, ground, work, progress and partial(progress, "views"))
-    splats = GroundSplats(mapper, ground)
+    splats = GroundSplats(shown, ground)
     resolution = max(_spacing(splats.places, ranges), MATCH_PX * ranges.footprint)
     reach = ranges.median_range * float(
         np.median([view.camera.width / view.camera.fx for view in mapper.views])

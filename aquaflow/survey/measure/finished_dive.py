@@ -68,10 +68,12 @@ def numbers_at_the_end(dive: Dive, until: Deadline) -> ReefNumbers:
 def _draw(
     dive: Dive, mapper: Mapper, work: Path, cell: float | None, progress: Progress | None
 ) -> tuple[HeightField, Ground]:
-    from aquaflow.survey.measure.drawn_heights import draw_heights  # loads torch
+    from aquaflow.survey.export.ortho.shown_views import ShownViews  # loads torch
+    from aquaflow.survey.measure.drawn_heights import draw_heights
 
-    ground = ground_of(dive.frame, mapper)
-    return draw_heights(mapper, ground, work, cell, progress), ground
+    shown = ShownViews(mapper)
+    ground = ground_of(dive.frame, shown)
+    return draw_heights(shown, ground, work, cell, progress), ground
 
 
 def _places(dive: Dive) -> npt.NDArray[np.float64]:

@@ -46,7 +46,7 @@ def tilted(degrees: float, frame: WorldFrame = UPRIGHT) -> Mapper:
 
 def up_of(mapper: Mapper, frame: WorldFrame) -> Array:
     """[3] in the world of the sub-map."""
-    return np.asarray(ground_of(frame, mapper).T_gm.R[2])
+    return np.asarray(ground_of(frame, ShownViews(mapper)).T_gm.R[2])
 
 
 @pytest.mark.parametrize("degrees", [0.0, -12.0, 20.0])
@@ -55,7 +55,7 @@ def test_without_gravity_up_is_across_the_ground_and_not_against_the_cameras(
 ) -> None:
     mapper = tilted(degrees)
     assert np.degrees(np.arccos(up_of(mapper, UNKNOWN) @ UP)) < 2.0
-    said = ground_of(UNKNOWN, mapper).vertical
+    said = ground_of(UNKNOWN, ShownViews(mapper)).vertical
     assert said == "perpendicular to the mean plane of the ground; gravity is unknown"
 
 
@@ -65,10 +65,10 @@ def test_an_oblique_view_has_no_ground_without_gravity_and_has_one_with_it(degre
     with pytest.raises(
         InputError, match=r"from \d+ degrees aside.*measure level.*--telemetry"
     ) as e:
-        ground_of(UNKNOWN, mapper)
+        ground_of(UNKNOWN, ShownViews(mapper))
     aside = float(str(e.value).split("from ")[1].split()[0])
     assert aside == pytest.approx(abs(degrees), abs=3.0)
-    assert ground_of(UPRIGHT, mapper).vertical == ALONG_GRAVITY
+    assert ground_of(UPRIGHT, ShownViews(mapper)).vertical == ALONG_GRAVITY
 
 
 def test_what_is_no_plane_has_no_ground() -> None:
@@ -82,7 +82,7 @@ def test_what_is_no_plane_has_no_ground() -> None:
         turn = Rotation.from_euler("y", 22.5 * number, degrees=True).as_matrix()
         view.T_wc = Sim3(turn, np.array([2.0, 2.0, DEPTH_M]) - 2.5 * turn[:, 2])
     with pytest.raises(InputError, match="about no plane"):
-        ground_of(UNKNOWN, mapper)
+        ground_of(UNKNOWN, ShownViews(mapper))
 
 
 def numbers(folder: Path, mapper: Mapper, frame: WorldFrame) -> dict[str, float]:

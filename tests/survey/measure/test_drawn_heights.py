@@ -11,6 +11,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
+from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.measure.areas import areas
 from aquaflow.survey.measure.drawn_heights import draw_heights, found_cell
 from aquaflow.survey.measure.height_field import HeightField
@@ -42,11 +43,11 @@ def mapper() -> Mapper:
 
 @pytest.fixture(scope="module")
 def drawn(mapper: Mapper, tmp_path_factory: pytest.TempPathFactory) -> HeightField:
-    return draw_heights(mapper, ground(mapper), tmp_path_factory.mktemp("work"), CELL)
+    return draw_heights(ShownViews(mapper), ground(mapper), tmp_path_factory.mktemp("work"), CELL)
 
 
 def ground(mapper: Mapper) -> Ground:
-    return ground_of(FRAME, mapper)
+    return ground_of(FRAME, ShownViews(mapper))
 
 
 def truth(field: HeightField) -> HeightField:
@@ -113,7 +114,7 @@ def test_what_no_gaussian_stands_for_is_surveyed_and_not_mapped(
     means = holed.gaussians.means.numpy()
     kept = ~((np.abs(means[:, 0] - 1.8) < 0.4) & (np.abs(means[:, 1] - 1.8) < 0.4))
     holed.scene.gaussians.keep(torch.from_numpy(kept))
-    found = draw_heights(holed, ground(holed), tmp_path, CELL)
+    found = draw_heights(ShownViews(holed), ground(holed), tmp_path, CELL)
     before, after = (areas(each, surface_ratio(each), EXACT) for each in (drawn, found))
     assert after.surveyed.value == pytest.approx(before.surveyed.value, rel=0.02)
     assert before.mapped.value - after.mapped.value == pytest.approx(
@@ -130,11 +131,11 @@ def test_cells_are_of_few_sizes_and_three_resolutions_long(resolution: float, ce
 
 def test_too_many_cells_are_refused(mapper: Mapper, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="larger --cell"):
-        draw_heights(mapper, ground(mapper), tmp_path, 1e-9)
+        draw_heights(ShownViews(mapper), ground(mapper), tmp_path, 1e-9)
 
 
 def test_ground_that_one_view_alone_sees_has_no_heights(mapper: Mapper, tmp_path: Path) -> None:
     alone = surveyed(FRAME)
     alone.views = alone.views[:1]
     with pytest.raises(InputError, match="no two views"):
-        draw_heights(alone, ground(alone), tmp_path, CELL)
+        draw_heights(ShownViews(alone), ground(alone), tmp_path, CELL)

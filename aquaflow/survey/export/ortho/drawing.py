@@ -60,12 +60,13 @@ class DrawnTile:
 class GroundSplats:
     """The Gaussians of a map on the ground, without those in open water."""
 
-    def __init__(self, mapper: Mapper, ground: Ground) -> None:
+    def __init__(self, shown: ShownViews, ground: Ground) -> None:
         """With a decoder, each Gaussian is as the view nearest to it sees it."""
+        mapper = shown.mapper
         self._renderer: Renderer = mapper.renderer
         splats = splats_of(mapper)
         if mapper.medium.active:
-            splats = splats.rows(~ShownViews(mapper).in_open_water(splats.means.astype(np.float64)))
+            splats = splats.rows(~shown.in_open_water(splats.means.astype(np.float64)))
         self._splats = splats.transform(ground.T_gm)
         self._reach = RADIUS_SIGMAS * self._splats.scales.max(axis=1, initial=0.0)
 

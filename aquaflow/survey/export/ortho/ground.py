@@ -19,7 +19,7 @@ from aquaflow.geometry.similarity import Sim3, nearest_rotation
 from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
-    from aquaflow.mapping.mapper import Mapper
+    from aquaflow.survey.export.ortho.shown_views import ShownViews
 
 Array = npt.NDArray[np.float64]
 
@@ -69,14 +69,14 @@ class Ground:
         return Sim3(T.R, T.t)
 
 
-def ground_of(frame: WorldFrame, mapper: Mapper) -> Ground:
+def ground_of(frame: WorldFrame, shown: ShownViews) -> Ground:
     """The ground of a sub-map: level where gravity is known, else the mean plane of what its views
     show, where that is one and they look squarely at it.
 
     Raises:
         InputError: gravity is unknown, and there is no such plane.
     """
-    poses = [frame.pose(view.T_wc) for view in mapper.views]
+    poses = [frame.pose(view.T_wc) for view in shown.mapper.views]
     epsg, corner, grid_scale = None, (0.0, 0.0), 1.0
     if frame.level:
         R_gn, vertical = UPRIGHT_FROM_DOWN, ALONG_GRAVITY
@@ -89,7 +89,7 @@ def ground_of(frame: WorldFrame, mapper: Mapper) -> Ground:
             place = grid.places(middle[None])[0]
             corner = tuple((place - grid_scale * (R_gn @ middle)[:2]).tolist())
     else:
-        R_gn, vertical = _on_mean_plane(poses, frame.T_nm.R, mapper), ACROSS_GROUND
+        R_gn, vertical = _on_mean_plane(poses, frame.T_nm.R, shown), ACROSS_GROUND
     return Ground(
         Sim3(R_gn, np.zeros(3)) @ frame.T_nm, frame.unit, epsg, corner, grid_scale,
         _axes_in_words(frame, epsg), vertical, _zero_in_words(frame),
@@ -99,12 +99,12 @@ def ground_of(frame: WorldFrame, mapper: Mapper) -> Ground:
 def _on_mean_plane(
     poses: list[Sim3],
     R_nm: Array,  # [3, 3]
-    mapper: Mapper,
+    shown: ShownViews,
 ) -> Array:
     """R_gn [3, 3]: up is the normal of what the views show, y is up in the first picture."""
-    from aquaflow.survey.export.ortho.shown_views import ShownViews, mean_normal  # loads torch
+    from aquaflow.survey.export.ortho.shown_views import mean_normal  # loads torch
 
-    normal = mean_normal(ShownViews(mapper).points())
+    normal = mean_normal(shown.points())
     if normal is None:
         raise InputError(f"what the cameras see lies about no plane, and {NO_VERTICAL}")
     up, look = R_nm @ normal, np.mean([T_nc.R[:, 2] for T_nc in poses], axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -56,12 +57,15 @@ def solid_ranges(mapper: Mapper, view: View) -> npt.NDArray[np.float32]:
 
 
 class ShownViews:
-    """Ranges of at most MOST_VIEWS views of a map."""
+    """At most MOST_VIEWS views of a map; drawn once, when it is first asked what they show."""
 
     def __init__(self, mapper: Mapper) -> None:
-        """Draws each of them once."""
+        self.mapper = mapper
         self._views = mapper.views[:: max(1, len(mapper.views) // MOST_VIEWS)]
-        self._ranges = [solid_ranges(mapper, view) for view in self._views]
+
+    @cached_property
+    def _ranges(self) -> list[npt.NDArray[np.float32]]:
+        return [solid_ranges(self.mapper, view) for view in self._views]
 
     def points(self) -> list[ShownPoints]:
         """Of each view that shows some."""

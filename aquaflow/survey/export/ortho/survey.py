@@ -94,14 +94,15 @@ def export_survey(
     """
     require_rasterio()
     mapper, frame = dive.filled_map(), dive.frame
-    ground = ground_of(frame, mapper)
+    shown = ShownViews(mapper)
+    ground = ground_of(frame, shown)
     ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
     side = resolution or round_to_digits(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
     grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
     through = ranges.median_range if water and mapper.medium.active else None
     colours = Colours(mapper, ground.T_gm.scale, through) if kind == "ortho" else None
-    looked = _Tiles(grid, GroundSplats(mapper, ground), ranges, colours)
+    looked = _Tiles(grid, GroundSplats(shown, ground), ranges, colours)
     tags = _tags(dive, frame, ground, side, through, colours is not None)
     covered = 0
     with whole_folder(out) as made, ExitStack() as files:
@@ -199,11 +200,12 @@ def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
     """
     from PIL import Image
 
-    ground = ground_of(frame, mapper)
-    low, high, distance = _extent(mapper, ground)
+    shown = ShownViews(mapper)
+    ground = ground_of(frame, shown)
+    low, high, distance = _extent(shown, ground)
     pixel = round_to_digits(float((high - low).max()) / LONGER_SIDE_PX)
     grid = Grid.around(low, high, pixel, low)
-    splats, colours = GroundSplats(mapper, ground), Colours(mapper, ground.T_gm.scale, None)
+    splats, colours = GroundSplats(shown, ground), Colours(mapper, ground.T_gm.scale, None)
     picture = np.zeros((grid.height, grid.width, 4), np.uint8)
     for tile in grid.tiles():
         chosen = splats.reaching(grid, tile)
@@ -230,16 +232,16 @@ def _tile(
     return np.dstack([rgb, alpha])
 
 
-def _extent(mapper: Mapper, ground: Ground) -> tuple[Array, Array, float]:
+def _extent(shown: ShownViews, ground: Ground) -> tuple[Array, Array, float]:
     """Lowest and highest x, y [2] of what the views show, and their median range."""
-    shown = ShownViews(mapper).points()
-    if not shown:
-        every = np.array([ground.pose(view.T_wc).t[:2] for view in mapper.views])
+    points = shown.points()
+    if not points:
+        every = np.array([ground.pose(view.T_wc).t[:2] for view in shown.mapper.views])
         return every.min(axis=0) - 1.0, every.max(axis=0) + 1.0, 1.0
-    places = ground.T_gm.apply(np.concatenate([each.places for each in shown]))
+    places = ground.T_gm.apply(np.concatenate([each.places for each in points]))
     low, high = np.percentile(places[:, :2], SHOWN, axis=0)
     return (
         low,
         high,
-        ground.T_gm.scale * float(np.median(np.concatenate([each.ranges for each in shown]))),
+        ground.T_gm.scale * float(np.median(np.concatenate([each.ranges for each in points]))),
     )
