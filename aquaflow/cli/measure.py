@@ -217,8 +217,7 @@ def scale(
 ) -> None:
     """Measure a known length in a dive's map, and so the metres of a map unit."""
     for name, value in (("length", length), ("sigma", sigma)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise typer.BadParameter(f"--{name} must be a positive number of metres")
+        _refuse_not_positive(name, value, "metres")
     from aquaflow.survey.measure.scale_bar import keep_length
     from aquaflow.telemetry.known_lengths.known_length import FILE, read_known_lengths
 
@@ -265,6 +264,11 @@ def _measure(
         return between_points(Dive(dive), ends[0], ends[1], length_m, sigma_m)
     pixels = [(point[0], point[1]) for point in (start, end)]
     return between_pixels(Dive(dive), frame, pixels[0], pixels[1], length_m, sigma_m)
+
+
+def _refuse_not_positive(name: str, value: float, unit: str) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise typer.BadParameter(f"--{name} must be a positive number of {unit}")
 
 
 def _numbers(option: str, text: str) -> tuple[float, ...]:
@@ -315,8 +319,8 @@ def level(
         raise typer.BadParameter("give --point three times at least, or --camera-pitch")
     if camera_pitch is not None and not -STEEPEST_DEG <= camera_pitch <= STEEPEST_DEG:
         raise typer.BadParameter(f"--camera-pitch must lie within \u00b1{STEEPEST_DEG:g} degrees")
-    if sigma is not None and not (math.isfinite(sigma) and sigma > 0.0):
-        raise typer.BadParameter("--sigma must be a positive number of degrees")
+    if sigma is not None:
+        _refuse_not_positive("sigma", sigma, "degrees")
     from aquaflow.survey.measure.asked import parse_point
     from aquaflow.survey.measure.levelling import (
         LEVEL_SIGMA_DEG,

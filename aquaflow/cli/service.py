@@ -179,8 +179,8 @@ def view(
             )
         window = open_site(dive, config, component)
     elif component is None:
-        marks = partial(_mark, dive), white_balance, partial(_turn, dive)
-        window = open_dive(dive, config, *marks)
+        mark, turn = partial(_mark, dive), partial(_turn, dive)
+        window = open_dive(dive, config, mark, white_balance, turn)
         if said := note_unfinished(dive):
             typer.echo(f"Warning: {said}.", err=True)
     else:

@@ -110,7 +110,7 @@ def unfinished_reason(dive: Path) -> str | None:
 def _why_cut_off(dive: Path, live: bool) -> str:
     if is_held(dive):
         return f"{dive} is being written by a running aquaflow; wait for its end, or stop it"
-    if any((dive / CHECKPOINT).glob("*.npz")):
+    if _has_checkpoint(dive):
         return (
             f"{dive} is not finished: its process was cut off, or the disk was full; "
             f"`aquaflow run finish {dive}` does the rest"
@@ -126,11 +126,15 @@ def _why_cut_off(dive: Path, live: bool) -> str:
     )
 
 
+def _has_checkpoint(dive: Path) -> bool:
+    return any((dive / CHECKPOINT).glob("*.npz"))
+
+
 def is_cut_off_replay(dive: Path) -> bool:
     """True where mapping a recording ended before it had a result, so that nothing is lost if it
     begins anew: the recording lies elsewhere. The caller holds the folder's lock."""
     status = read_status(dive)
-    if status is None or status.is_live or any((dive / CHECKPOINT).glob("*.npz")):
+    if status is None or status.is_live or _has_checkpoint(dive):
         return False
     no_result = status.state.is_complete and not (dive / METRICS).is_file()
     return status.state is DiveState.OPEN or no_result

@@ -11,7 +11,6 @@ from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive.deliverables import Deliverable
 from aquaflow.dive.dive import Dive
 from aquaflow.slam import Slam
-from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.coverage_file import NAME, write_coverage_file
 from aquaflow.survey.coverage.dive_coverage import DiveCoverage
 from aquaflow.survey.coverage.footprint import mapping_range
@@ -80,11 +79,7 @@ def numbers(view: PageView) -> dict[str, Any]:
     return {
         "unit": view.unit,
         "area": view.areas,
-        "share": {
-            seen.name.lower(): view.share(seen)
-            for seen in CoverageClass
-            if seen is not CoverageClass.NOT
-        },
+        "share": view.shares,
         "cell": view.plan.frame.cell * view.scale,
         "range_limit": None if limit is None else limit * view.scale,
         "swath": state.swath,

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.config.service import CoverageConfig
 from aquaflow.dive.placement import FROM_ABOVE, names_of, page_axes
-from aquaflow.survey.coverage.classes import CoverageClass
+from aquaflow.survey.coverage.classes import COLOURS, CoverageClass
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
 from aquaflow.survey.coverage.survey_lines import LineState, line_state, survey_lines
@@ -42,9 +42,12 @@ class PageView:
         """Area of a class, in the square of ``unit``."""
         return self.plan.area(seen) * self.scale**2
 
-    def share(self, seen: CoverageClass) -> float:
-        """Of what was seen at all, on the page."""
-        return self.plan.cells.get(seen, 0) / max(1, sum(self.plan.cells.values()))
+    @property
+    def shares(self) -> dict[str, float]:
+        """Of what was seen at all, on the page: each class by name."""
+        counts = self.plan.cells
+        whole = max(1, sum(counts.values()))
+        return {seen.name.lower(): counts.get(seen, 0) / whole for seen in COLOURS}
 
     @property
     def areas(self) -> dict[str, float] | None:
@@ -52,11 +55,7 @@ class PageView:
         ground has another size than on a chart."""
         if self.seen != FROM_ABOVE or self.unit != "m":
             return None
-        return {
-            seen.name.lower(): self.area(seen)
-            for seen in CoverageClass
-            if seen is not CoverageClass.NOT
-        }
+        return {seen.name.lower(): self.area(seen) for seen in COLOURS}
 
     def rescale(self, times: float, unit: str) -> PageView:
         """The same in another unit, of which one of before is ``times``."""

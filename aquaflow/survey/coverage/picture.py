@@ -130,11 +130,10 @@ def _path(draw: ImageDraw, view: PageView, fit: _PageTransform) -> None:
 def _foot(draw: ImageDraw, view: PageView, fit: _PageTransform) -> None:
     """Legend with areas, or shares where there are none, and a scale bar."""
     x, y = float(MARGIN), HEIGHT - FOOT + 8
-    areas = view.areas
+    areas, shares = view.areas, view.shares
     for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR):
-        size = f"{100.0 * view.share(seen):.0f} %"
-        if areas is not None:
-            size = f"{areas[seen.name.lower()]:.3g} sq m"
+        name = seen.name.lower()
+        size = f"{100.0 * shares[name]:.0f} %" if areas is None else f"{areas[name]:.3g} sq m"
         text = f"{WORDS[seen]}: {size}"
         draw.rectangle([x, y + 2, x + 11, y + 13], fill=COLOURS[seen])
         draw.text((x + 16, y), text, fill=INK, font_size=TEXT_PX)

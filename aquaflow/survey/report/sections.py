@@ -314,12 +314,13 @@ def coverage_words(view: PageView) -> str:
 
 def coverage_rows(view: PageView) -> Rows:
     """Areas, lines and overlap; without metres, or from aside, only shares."""
-    areas = view.areas
+    areas, shares = view.areas, view.shares
     rows: Rows = []
     for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR):
-        share = f"{100.0 * view.share(seen):.0f} %"
+        name = seen.name.lower()
+        share = f"{100.0 * shares[name]:.0f} %"
         if areas is not None:
-            share = f"{areas[seen.name.lower()]:.3g} m\u00b2 ({share})"
+            share = f"{areas[name]:.3g} m\u00b2 ({share})"
         rows.append((WORDS[seen], share))
     state, limit = view.state, view.plan.limit
     if view.unit == "m":
