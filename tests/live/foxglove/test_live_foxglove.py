@@ -111,7 +111,13 @@ def live(
     config = FoxgloveConfig(enabled=True, port=0, pose_hz=60.0, refresh_s=0.01, points=200)
     with LiveDive("live", resume_folder(folder, new=False), ToldFeed(), VEHICLE) as dive:
         loop, begun_ns = dive.parts.loop, time.time_ns()
-        foxglove = LiveFoxglove(config, lambda: report(dive.parts, 1e6))
+        reports: list[dict[str, Any]] = []
+
+        def reported() -> dict[str, Any]:
+            reports.append(report(dive.parts, 1e6))
+            return reports[-1]
+
+        foxglove = LiveFoxglove(config, reported)
         loop.watchers.append(foxglove.update)
         listener = Listener(example, foxglove.port)
         until(lambda: foxglove._server.is_wanted(topics.POINTS))
@@ -124,17 +130,27 @@ def live(
                 topics.RENDERED,
                 topics.PATH,
                 topics.CAMERA,
+                topics.POSE,
                 topics.DIAGNOSTICS,
             }
             until(lambda: wanted <= set(heard), lambda: loop.take(None))
             until(lambda: len(heard[topics.TF]) > 1, lambda: loop.take(None))
+            until(lambda: has_newest_frame(foxglove, dive, heard), lambda: loop.take(None))
             yield SimpleNamespace(
                 dive=dive, heard=heard, connection=listener.connection, begun_ns=begun_ns,
-                picture=loop.picture,
+                picture=loop.picture, reported=reports[-1],
             )  # fmt: skip
         finally:
             listener.close()
             foxglove.close()
+
+
+def has_newest_frame(foxglove: LiveFoxglove, dive: LiveDive, heard: Received) -> bool:
+    """Whether what was heard last is of the dive's newest frame."""
+    latest = dive.parts.loop.latest
+    assert latest is not None
+    stamp_ns = foxglove._stamps[latest.frame.index]
+    return all(heard[topic][-1][0] == stamp_ns for topic in (topics.POSE, topics.DIAGNOSTICS))
 
 
 def test_all_topics_are_offered_with_the_definitions_of_ros(live: SimpleNamespace) -> None:
@@ -188,7 +204,7 @@ def test_pictures_and_points_can_be_read(live: SimpleNamespace) -> None:
 
 
 def test_diagnostics_say_the_state_and_its_reason(live: SimpleNamespace) -> None:
-    said = report(live.dive.parts, 1e6)
+    said = live.reported
     array = decoded(topics.DIAGNOSTICS, live.heard[topics.DIAGNOSTICS][-1][1])
     tracking = array.status[0]
     assert tracking.name == "aquaflow: tracking"
