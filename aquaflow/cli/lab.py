@@ -51,6 +51,10 @@ def synth(
     lamps: Annotated[
         float | None, typer.Option(help="Lamps by the camera; the share of daylight, 0 to 1.")
     ] = None,
+    range_effects: Annotated[
+        bool,
+        typer.Option("--range-effects", help="Blur and colour that no medium explains, by range."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Write a synthetic dive with its ground truth."""
@@ -64,6 +68,7 @@ def synth(
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
         "seed": seed, "display": display, "fish": fish, "arm": arm,
         "lamps": None if lamps is None else {"ambient": lamps},
+        "range_effects": {} if range_effects else None,
     }  # fmt: skip
     try:
         config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})

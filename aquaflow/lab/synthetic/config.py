@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from aquaflow.geometry.port import PortFile
@@ -86,10 +88,41 @@ class Lamps(BaseModel):
         return math.log(0.5) / math.log(math.cos(math.radians(self.half_angle_deg)))
 
 
+# --------------------------------------------------------------------------------------------------
+# What water does with range beyond the image formation.
+
+
+class RangeEffects(BaseModel):
+    """Blur and colours that change with range as no medium of water.py can (range_effects.py)."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    blur_mrad: float = Field(
+        3.0,
+        ge=0.0,
+        le=20.0,
+        description="mrad, sigma of a point 1 m away; grows with the root of the range; judgement: "
+        "1.2 px there at 480 px width, twice the lens's own, and twice that at 4 m",
+    )
+    band_spread: tuple[float, float, float] = Field(
+        (0.6, 0.3, 0.3),
+        description="standard deviation over mean of the attenuation within a channel's band, "
+        "RGB; judgement: pure water's absorption goes from 0.2 to 0.6 per metre over the red band",
+    )
+
+    def blur_rad(
+        self,
+        z: npt.NDArray[np.float32],  # [...] m
+    ) -> npt.NDArray[np.float32]:
+        """[...] rad, sigma of a point at each range."""
+        return np.float32(1e-3 * self.blur_mrad) * np.sqrt(z)
+
+
 __all__ = [
     "FACED",
     "Display",
     "Lamps",
+    "RangeEffects",
     "SceneKind",
     "SyntheticConfig",
     "TelemetryNoise",
@@ -203,6 +236,11 @@ class SyntheticConfig(BaseModel):
         description="relative change of beta_a with the heading: that much more looking north, as "
         "much less looking south; 0: the same all round, as in the water's table",
     )
+    range_effects: RangeEffects | None = Field(
+        None,
+        description="blur and colour that the image formation cannot say; None: none; with them "
+        "beta_a is that of the first centimetres",
+    )
     supersampling: int = Field(2, ge=1, le=4, description="rays per pixel and axis; 2 is 4 rays")
     speed_m_s: float = Field(
         0.6,
@@ -292,6 +330,12 @@ class SyntheticConfig(BaseModel):
             raise ValueError(
                 f"a vehicle at a {self.scene} faces it; turns must be false for this scene"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _effects_by_daylight(self) -> SyntheticConfig:
+        if self.range_effects is not None and self.lamps is not None:
+            raise ValueError("range_effects are of daylight; leave them or lamps out")
         return self
 
     @model_validator(mode="after")

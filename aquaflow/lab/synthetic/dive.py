@@ -25,6 +25,7 @@ from aquaflow.lab.synthetic.display import burn_in
 from aquaflow.lab.synthetic.march import RayHeightField
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.planted import bleach
+from aquaflow.lab.synthetic.range_effects import with_range_effects
 from aquaflow.lab.synthetic.sensor import Snow, expose, quantise, vignette
 from aquaflow.lab.synthetic.site import SurveySite, camera_of, site_of
 from aquaflow.lab.synthetic.streams import stream
@@ -179,7 +180,10 @@ def _write_pictures(
                 bodies.at(k),
                 config.lamps,
             )
-            water = view.water.copy()
+            if config.range_effects is None:
+                water = view.water.copy()
+            else:
+                water = with_range_effects(view, medium, camera.fx, config.range_effects)
             pose = R_sc[k], centres[k], float(t[k])
             snow.draw(water, view.range_m, camera, *pose, medium, config.lamps)
             picture = expose(water * light, shade, config.noise_sigma, noise_rng)
