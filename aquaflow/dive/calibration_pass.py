@@ -277,7 +277,7 @@ def in_words(found: FoundCamera | None, tracked: CameraModel, file: str) -> str:
     unknown = f"{guessed.fx:.0f} px is a guess, good to {UNKNOWN_PERCENT} %"
     if found is None:
         return (
-            f"no calibration was used, and too few pictures show the lens: the focal length of "
+            f"no calibration was used, and the pictures do not show the lens: the focal length of "
             f"{unknown}, distortion ignored"
         )
     if not found.lens.known:
@@ -309,14 +309,22 @@ def from_keyframes(keyframes: Sequence[Keyframe]) -> FoundCamera | None:
     return None if camera is None else FoundCamera(camera, lens, used=False)
 
 
+SEEN_WIDTHS = (0.12, 6.0)
+"""Picture widths between which focal lengths under water lie: 153 to 10 degrees of view. Where
+poses are wrong, the adjustment can run off to rays that are all parallel: 130 widths on IUI3."""
+
+
 def usable(camera: CameraModel) -> CameraModel | None:
-    """None for a distortion that folds the picture over itself."""
+    """None for a focal length that no camera has, or a distortion that folds the picture over
+    itself."""
+    possible = SEEN_WIDTHS[0] <= camera.fx / camera.width <= SEEN_WIDTHS[1]
     try:
         Rectifier(camera, camera.width)
     except ConfigError:
+        possible = False
+    if not possible:
         log.warning("the lens that was found cannot be: %s", camera)
-        return None
-    return camera
+    return camera if possible else None
 
 
 # --------------------------------------------------------------------------------------------------

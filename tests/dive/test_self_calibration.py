@@ -93,7 +93,7 @@ def test_what_is_known_is_said_and_what_is_not_known_is_a_guess() -> None:
     assert "524 ± 5 px (1.0 %)" in in_words(found(0.01, True), GUESS, "f.yaml")
     assert "does not determine" in in_words(found(0.2, True), GUESS, "f.yaml")
     assert "f.yaml" in in_words(found(0.01, False), GUESS, "f.yaml")
-    assert "too few pictures" in in_words(None, GUESS, "f.yaml")
+    assert "pictures do not show" in in_words(None, GUESS, "f.yaml")
     assert not found(0.2, False).suggested
 
 
@@ -101,6 +101,12 @@ def test_a_lens_that_folds_the_picture_is_not_used() -> None:
     folding = FoundLens(np.array([0.0, -1.5, 0, 0, 0]), np.array([0.01, 0.01]), 3e-4, 24, 9000)
     assert usable(folding.camera(GUESS)) is None
     assert usable(lens(0.25, 0.01).camera(GUESS)) is not None
+
+
+@pytest.mark.parametrize("change", [-2.1, 2.1, 5.0])
+def test_a_focal_length_that_no_camera_has_is_not_used(change: float) -> None:
+    """Ten times off and more: the adjustment ran off, however sure it is of itself."""
+    assert usable(lens(change, 0.01).camera(GUESS)) is None
 
 
 def test_a_still_camera_shows_no_lens(small_recording: Path, tmp_path: Path) -> None:
