@@ -218,6 +218,7 @@ def scale(
     """Measure a known length in a dive's map, and so the metres of a map unit."""
     for name, value in (("length", length), ("sigma", sigma)):
         _refuse_not_positive(name, value, "metres")
+    _with_map(dive)
     from aquaflow.survey.measure.scale_bar import keep_length
     from aquaflow.telemetry.known_lengths.known_length import FILE, read_known_lengths
 
@@ -321,6 +322,7 @@ def level(
         raise typer.BadParameter(f"--camera-pitch must lie within \u00b1{STEEPEST_DEG:g} degrees")
     if sigma is not None:
         _refuse_not_positive("sigma", sigma, "degrees")
+    _with_map(dive)
     from aquaflow.survey.measure.asked import parse_point
     from aquaflow.survey.measure.levelling import (
         LEVEL_SIGMA_DEG,

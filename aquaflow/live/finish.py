@@ -9,7 +9,13 @@ from pathlib import Path
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, read_status, refuse_unfinished
+from aquaflow.base.storage.dive_status import (
+    CHECKPOINT,
+    DiveState,
+    read_status,
+    refuse_missing,
+    refuse_unfinished,
+)
 from aquaflow.base.storage.whole_folder import refuse_held
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
@@ -69,6 +75,7 @@ def refuse_unfit(dive: Path) -> None:
         FinishedAlreadyError: it is; what its last process had no time to remove is removed.
         InputError: it is no dive, a running service writes to it, or it is a replay.
     """
+    refuse_missing(dive)
     if not (dive / MARKER).is_file():
         raise InputError(f"{dive} is no dive: it has no {MARKER}; give the folder of a dive")
     refuse_held(dive)

@@ -184,6 +184,34 @@ def test_evaluate_refuses_a_folder_that_is_no_dive(
         refused(aquaflow("lab", "evaluate", folder, "--clean", small_recording), folder)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("measure", "DIVE"),
+        ("measure", "level", "DIVE", "--camera-pitch", "30"),
+        ("measure", "scale", "DIVE", "--from", "1,2,3", "--to", "2,3,4", "--length", "1"),
+        ("export", "DIVE", "--format", "laz"),
+        ("export", "report", "DIVE"),
+        ("export", "video", "DIVE", "--out", "x.mp4"),
+        ("view", "DIVE"),
+        ("run", "finish", "DIVE"),
+        ("site", "add", "SITE", "DIVE"),
+        ("change", "--from", "DIVE", "--to", "DIVE", "--transform", "t.json", "--out", "c"),
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_a_folder_that_is_not_there_or_is_no_dive_is_named_as_the_cause(
+    aquaflow: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    none, empty = tmp_path / "none", tmp_path / "empty"
+    empty.mkdir()
+    for folder, said in ((none, "no folder"), (empty, "dive")):
+        ran = aquaflow(*(str(folder) if each == "DIVE" else each for each in words))
+        refused(ran, folder, said)
+        assert "metric.json" not in ran.err
+
+
 def test_evaluate_refuses_a_truth_that_is_none(
     aquaflow: Cli, small_dive: Path, tmp_path: Path
 ) -> None:

@@ -140,12 +140,19 @@ def is_cut_off_replay(dive: Path) -> bool:
     return status.state is DiveState.OPEN or no_result
 
 
+def refuse_missing(dive: Path) -> None:
+    """Raises InputError if there is no such folder."""
+    if not dive.is_dir():
+        raise InputError(f"there is no folder {dive}; give the folder of a dive")
+
+
 def refuse_unfinished(dive: Path) -> None:
     """For whoever takes a dive's files as those of a finished one.
 
     Raises:
-        InputError: they are not; what happened, and what to do.
+        InputError: they are not, or there is no such folder; what happened, and what to do.
     """
+    refuse_missing(dive)
     said = unfinished_reason(dive)
     if said is not None:
         raise InputError(said)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
-from aquaflow.base.storage.dive_status import unfinished_reason
+from aquaflow.base.storage.dive_status import refuse_missing, unfinished_reason
 from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import CAMERA, FRAMES, TRAJECTORY, Dive
 from aquaflow.geometry.camera import CameraModel
@@ -89,6 +89,7 @@ def finished_dive(dive: Dive, budget: int) -> FinishedDive:
     Raises:
         InputError: it is not finished.
     """
+    refuse_missing(dive.path)
     said = unfinished_reason(dive.path)
     for name in WHOLE:
         if not dive.has(name):

@@ -15,7 +15,7 @@ from tests.command_line import Cli
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--from", "nowhere", "--to", "nowhere"], "nowhere holds no finished dive"),
+        (["--from", "nowhere", "--to", "nowhere"], "there is no folder nowhere"),
         (["--from", "a", "--to", "b", "--cylinder", "-1"], "--cylinder -1 is no length"),
         (["--from", "a", "--to", "b", "--reach", "nan"], "--reach nan is no length"),
         (["--from", "a", "--to", "b", "--false", "0"], "--false 0 is no share"),
