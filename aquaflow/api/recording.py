@@ -81,6 +81,6 @@ def map_recording(
 
     replay.map_recording(
         recording, name, Path(out), chosen, camera, overwrite, progress, telemetry=given,
-        base=base,
+        base=base, path=path,
     )  # fmt: skip
     return read_dive(out)

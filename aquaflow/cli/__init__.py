@@ -192,7 +192,7 @@ def map_command(
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
             recording, source.name, out, settings, calibration, overwrite, progress, profile,
-            given, base=None if in_site is None else base_of(in_site),
+            given, base=None if in_site is None else base_of(in_site), path=source,
         )  # fmt: skip
     _print_replayed(replayed, as_json)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from enum import Enum
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum, StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
 
 
-class ExportFormat(str, Enum):
+class ExportFormat(StrEnum):
     """What a dive can be written as."""
 
     restored = "restored"
@@ -50,7 +51,12 @@ NAMES = {
     ExportFormat.dem: "dem",
     ExportFormat.mcap: "dive.mcap",
 }
-"""Of what is written, in the dive's folder."""
+"""Of what is written, in the dive's folder or in ``--out``."""
+ENDINGS = {
+    **{format: Path(name).suffix for format, name in NAMES.items() if Path(name).suffix},
+    **{ExportFormat.ortho: ".tif", ExportFormat.dem: ".tif"},
+}
+"""Of formats that ``--out`` may name a file of."""
 OPTIONS = {
     ExportFormat.restored: {"--recording", "--white-balance"},
     ExportFormat.laz: {"--water", "--white-balance"},
@@ -66,12 +72,19 @@ OPTIONS = {
     ExportFormat.mcap: {"--recording", "--white-balance"},
 }
 """Which options a format knows, besides --out and --json."""
+RASTERS: dict[ExportFormat, Literal["ortho", "dem"]] = {
+    ExportFormat.ortho: "ortho",
+    ExportFormat.dem: "dem",
+}
+"""Formats that are drawn from straight above, in one go."""
 MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
     ExportFormat.ply: "ply",
     ExportFormat.obj: "obj",
     ExportFormat.glb: "glb",
 }
-"""Formats that are triangles."""
+"""Formats that are triangles, of one surface."""
+FOLDERS = {ExportFormat.restored, *RASTERS, ExportFormat.colmap, ExportFormat.nerfstudio}
+"""Formats that fill a folder."""
 POSED = {ExportFormat.colmap, ExportFormat.nerfstudio}
 """Formats of pictures that are as the camera saw them unless ``--restored`` says otherwise."""
 REPORT = "report.pdf"
@@ -79,6 +92,7 @@ REPORT = "report.pdf"
 
 
 Progress = Callable[[int, int], None]
+Bars = Callable[[str, int, int], None]
 
 
 def export_group() -> typer.Typer:
@@ -93,18 +107,23 @@ def export_group() -> typer.Typer:
 def export(
     dive: Annotated[Path, typer.Argument(help="Dive folder.")],
     format: Annotated[
-        ExportFormat,
+        str | None,
         typer.Option(
-            help="restored: frames without their water. laz, e57: the map as points. "
+            help="One or more, with commas between. "
+            "restored: frames without their water. laz, e57: the map as points. "
             "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed. "
             "ply, obj, glb: the surface as triangles. "
             "ortho: the ground from straight above. dem: its heights. "
             "mcap: all of it for Foxglove and ROS 2."
         ),
-    ],
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="All formats.")] = False,
     recording: Annotated[
         Path | None,
-        typer.Option(help="What was mapped; without it, pictures without water are drawn."),
+        typer.Option(
+            help="What was mapped, if it no longer lies where it was; without it, "
+            "pictures without water are drawn."
+        ),
     ] = None,
     restored: Annotated[
         bool, typer.Option("--restored", help="Pictures and points without water.")
@@ -120,16 +139,20 @@ def export(
     ] = None,
     white_balance: WhiteBalanceOption = None,
     out: Annotated[
-        Path | None, typer.Option(help="File or folder to write; else in the dive's.")
+        Path | None,
+        typer.Option(
+            help="Folder to write to, or a file with the format's ending; else the dive's folder."
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Write a dive for other programs: pictures without water, points, posed pictures, maps."""
+    formats = _asked_formats(format, every)
     given = {
         "--recording": recording is not None, "--restored": restored, "--water": water,
         "--resolution": resolution is not None, "--white-balance": white_balance is not None,
     }  # fmt: skip
-    _refuse_others(format, given)
+    _refuse_others(formats, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
     from aquaflow.dive.dive import MAP, Dive
@@ -137,33 +160,115 @@ def export(
     read = Dive(dive)
     read.require(MAP)
     if white_balance is not None:
-        shows_water = water or (format in POSED and not restored)
-        _choose_white(read, white_balance, shows_water)
-    target = _make_parents(out) if out else _own_target(dive / NAMES[format])
+        _choose_white(read, white_balance, water or (not restored and set(formats) <= POSED))
+    targets = _targets(dive, formats, out)
     with progress_bars(quiet=as_json) as bars:
-
-        def progress(done: int, total: int) -> None:
-            bars(format.value, done, total)
-
-        if format is ExportFormat.restored:
-            said, facts = _restore(read, target, recording, progress)
-        elif format in (ExportFormat.laz, ExportFormat.e57):
-            said, facts = _points(read, target, format, water, progress)
-        elif format is ExportFormat.spz:
-            said, facts = _compress(read, target, water)
-        elif format in (ExportFormat.ortho, ExportFormat.dem):
-            kind: Literal["ortho", "dem"] = "dem" if format is ExportFormat.dem else "ortho"
-            said, facts = _survey(read, target, kind, resolution, water, bars)
-        elif format in MESHES:
-            said, facts = _mesh(read, target, MESHES[format], resolution, water, bars)
-        elif format is ExportFormat.mcap:
-            said, facts = _messages(read, target, recording, progress)
-        else:
-            said, facts = _posed_pictures(read, target, format, recording, restored, progress)
+        job = _Job(read, recording or read.recording, restored, water, resolution, bars)
+        done = _write_each(job, targets)
     if as_json:
-        typer.echo(json.dumps({"out": str(target), **facts}))
+        facts = {each.value: {"out": str(targets[each]), **of} for each, (_, of) in done.items()}
+        typer.echo(json.dumps(facts if len(formats) > 1 else facts[formats[0].value]))
     else:
-        typer.echo(said)
+        typer.echo("\n".join(said for said, _ in done.values()))
+
+
+def _asked_formats(format: str | None, every: bool) -> list[ExportFormat]:
+    """Raises typer.BadParameter where none, or one that does not exist, is asked for."""
+    if every == (format is not None):
+        raise typer.BadParameter("give --format, or --all")
+    if format is None:
+        return list(ExportFormat)
+    words = [word.strip() for word in format.split(",")]
+    for word in words:
+        if word not in set(ExportFormat):
+            known = ", ".join(ExportFormat)
+            raise typer.BadParameter(f"{word!r} is no --format; there are {known}")
+    return [each for each in ExportFormat if each.value in words]
+
+
+def _targets(
+    dive: Path, formats: Sequence[ExportFormat], out: Path | None
+) -> dict[ExportFormat, Path]:
+    """Where each format is written to: its usual name in the dive or in ``out``, unless a single
+    one is named, or fills a folder.
+
+    Raises:
+        InputError: ``out`` is a file of another format, or no folder can be there.
+    """
+    if out is None:
+        return {each: _own_target(dive / NAMES[each]) for each in formats}
+    ending, first = out.suffix.lower(), formats[0]
+    if ending in ENDINGS.values():
+        if len(formats) == 1 and ENDINGS.get(first) == ending:
+            return {first: _make_parents(out)}
+        own = (
+            f"a file ending in {ENDINGS[first]}, or "
+            if len(formats) == 1 and first in ENDINGS
+            else ""
+        )
+        raise InputError(f"--out {out} is no name for {', '.join(formats)}; give {own}a folder")
+    if len(formats) == 1 and first in FOLDERS:
+        return {first: _make_parents(out)}
+    return {each: _make_parents(out / NAMES[each]) for each in formats}
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What is asked for, of all formats."""
+
+    dive: Dive
+    recording: Path | None
+    restored: bool
+    water: bool
+    resolution: float | None
+    bars: Bars
+
+    def progress(self, format: ExportFormat) -> Progress:
+        """A function (done, total) for the bar of a format."""
+        return lambda done, total: self.bars(format.value, done, total)
+
+
+Made: TypeAlias = dict[ExportFormat, tuple[str, dict[str, Any]]]
+"""Of each format: what is said, and the same as facts."""
+
+
+def _write_each(job: _Job, targets: Mapping[ExportFormat, Path]) -> Made:
+    """Write the formats; one that fails costs itself.
+
+    Raises:
+        InputError: some failed, after all others are written.
+    """
+    made: Made = {}
+    failed: dict[str, list[str]] = {}
+    single = [[each] for each in targets if each not in {**RASTERS, **MESHES}]
+    grouped = [[each for each in targets if each in kind] for kind in (RASTERS, MESHES)]
+    for group in filter(None, [*single, *grouped]):
+        together = {each: targets[each] for each in group}
+        try:
+            made |= _write(job, together)
+        except InputError as error:
+            if len(targets) == 1:
+                raise
+            failed.setdefault(str(error), []).extend(together)
+    if failed:
+        for said, _ in made.values():
+            typer.echo(said, err=True)
+        raise InputError("; ".join(f"{', '.join(names)}: {why}" for why, names in failed.items()))
+    return made
+
+
+def _write(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
+    """Write formats that are made in one go."""
+    format, path = next(iter(together.items()))
+    if format in RASTERS:
+        return _survey(job, together)
+    if format in MESHES:
+        return _mesh(job, together)
+    write = {
+        ExportFormat.restored: _restore, ExportFormat.spz: _compress, ExportFormat.mcap: _messages,
+        ExportFormat.laz: _points, ExportFormat.e57: _points,
+    }.get(format, _posed_pictures)  # fmt: skip
+    return {format: write(job, path, format)}
 
 
 def report(
@@ -222,30 +327,32 @@ def _choose_white(dive: Dive, white_balance: str, shows_water: bool) -> None:
     show_in(dive, white_balance)
 
 
-def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
-    unknown = [name for name, is_given in given.items() if is_given and name not in OPTIONS[format]]
+def _refuse_others(formats: Sequence[ExportFormat], given: dict[str, bool]) -> None:
+    known = set().union(*(OPTIONS[each] for each in formats))
+    unknown = [name for name, is_given in given.items() if is_given and name not in known]
     if unknown:
-        raise InputError(f"--format {format.value} knows no {unknown[0]}; leave it out")
+        raise InputError(f"--format {','.join(formats)} knows no {unknown[0]}; leave it out")
 
 
-def _restore(
-    dive: Dive, folder: Path, recording: Path | None, progress: Progress
-) -> tuple[str, dict[str, Any]]:
+def _restore(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.restored import export_restored
 
-    count = export_restored(dive, folder, recording, progress)
-    return f"Wrote {count} restored frames to {folder}.", {"frames": count}
+    count = export_restored(job.dive, path, job.recording, job.progress(format))
+    return f"Wrote {count} restored frames to {path}{_source(job)}.", {"frames": count}
 
 
-def _points(
-    dive: Dive, path: Path, format: ExportFormat, water: bool, progress: Progress
-) -> tuple[str, dict[str, Any]]:
+def _source(job: _Job) -> str:
+    """Which pictures were taken, for the end of a sentence."""
+    return ", drawn from the map" if job.recording is None else f", from {job.recording}"
+
+
+def _points(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.point_cloud import read_point_cloud
     from aquaflow.survey.export.point_clouds import write_e57, write_laz
 
-    cloud = read_point_cloud(dive, water)
+    cloud = read_point_cloud(job.dive, job.water)
     write = write_laz if format is ExportFormat.laz else write_e57
-    write(path, cloud, progress)
+    write(path, cloud, job.progress(format))
     where = cloud.placement
     return f"Wrote {len(cloud)} points to {path}: {where.in_words()}.", {
         "points": len(cloud),
@@ -255,66 +362,58 @@ def _points(
     }
 
 
-def _compress(dive: Dive, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
+def _compress(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.spz import export_spz
 
-    count, where = export_spz(dive, path, water)
+    count, where = export_spz(job.dive, path, job.water)
     facts = {"gaussians": count, "unit": where.unit}
     return f"Wrote {count} Gaussians to {path}; lengths are {where.unit}, y is up.", facts
 
 
-def _mesh(
-    dive: Dive,
-    path: Path,
-    kind: Literal["ply", "obj", "glb"],
-    resolution: float | None,
-    water: bool,
-    bars: Callable[[str, int, int], None],
-) -> tuple[str, dict[str, Any]]:
+def _mesh(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
     from aquaflow.survey.export.mesh.export_mesh import export_mesh
 
-    mesh = export_mesh(dive, path, kind, resolution, water, bars)
-    unit, names = mesh.where.unit, " and ".join(str(file) for file in mesh.files)
-    said = [
-        f"Wrote {names}: {mesh.triangles} triangles of {mesh.voxel:g} {unit}, {mesh.seen}.",
-        f"Coordinates: {mesh.where.in_words()}"
-        + (f", less {mesh.origin[0]:g}, {mesh.origin[1]:g}." if mesh.where.epsg else "."),
-    ]
-    return "\n".join(said), {
-        "files": [str(file) for file in mesh.files],
-        "vertices": mesh.vertices, "triangles": mesh.triangles, "area": mesh.area,
-        "resolution": mesh.voxel, "sigma": mesh.sigma, "texture": mesh.texture,
-        "unit": unit, "epsg": mesh.where.epsg, "axes": mesh.where.in_words(),
-        "origin": mesh.origin, "colours": mesh.seen,
-    }  # fmt: skip
+    targets = {MESHES[each]: path for each, path in together.items()}
+    mesh = export_mesh(job.dive, targets, job.resolution, job.water, job.bars)
+    made: Made = {}
+    unit = mesh.where.unit
+    for each in together:
+        files = [str(file) for file in mesh.files[MESHES[each]]]
+        said = (
+            f"Wrote {' and '.join(files)}: {mesh.triangles} triangles of {mesh.voxel:g} {unit}, "
+            f"{mesh.seen}.\nCoordinates: {mesh.where.in_words()}"
+        )
+        said += f", less {mesh.origin[0]:g}, {mesh.origin[1]:g}." if mesh.where.epsg else "."
+        made[each] = said, {
+            "files": files,
+            "vertices": mesh.vertices, "triangles": mesh.triangles, "area": mesh.area,
+            "resolution": mesh.voxel, "sigma": mesh.sigma,
+            "texture": None if each is ExportFormat.ply else mesh.texture,
+            "unit": unit, "epsg": mesh.where.epsg, "axes": mesh.where.in_words(),
+            "origin": mesh.origin, "colours": mesh.seen,
+        }  # fmt: skip
+    return made
 
 
-def _posed_pictures(
-    dive: Dive,
-    folder: Path,
-    format: ExportFormat,
-    recording: Path | None,
-    restored: bool,
-    progress: Progress,
-) -> tuple[str, dict[str, Any]]:
+def _posed_pictures(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.restored import export_posed_pictures
     from aquaflow.survey.export.posed_pictures import write_colmap, write_nerfstudio
 
     write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
-    count = export_posed_pictures(dive, folder, write, recording, restored, progress)
-    return f"Wrote {count} pictures with their poses to {folder}.", {"frames": count}
+    count = export_posed_pictures(
+        job.dive, path, write, job.recording, job.restored, job.progress(format)
+    )
+    return f"Wrote {count} pictures with their poses to {path}{_source(job)}.", {"frames": count}
 
 
-def _messages(
-    dive: Dive, path: Path, recording: Path | None, progress: Progress
-) -> tuple[str, dict[str, Any]]:
+def _messages(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.mcap_export import export_mcap
 
-    wrote = export_mcap(dive, path, recording, progress)
+    wrote = export_mcap(job.dive, path, job.recording, job.progress(format))
     where = wrote.where
     said = (
         f"Wrote {wrote.messages} messages to {path}, {wrote.poses} poses and {wrote.pictures} "
-        f"pictures among them; a layout for Foxglove to {wrote.layout}.\n"
+        f"pictures among them{_source(job)}; a layout for Foxglove to {wrote.layout}.\n"
         f"Frame map: {where.axes}; {where.unit}. Times: {wrote.times}."
     )
     return said, {
@@ -323,34 +422,34 @@ def _messages(
     }  # fmt: skip
 
 
-def _survey(
-    dive: Dive,
-    folder: Path,
-    kind: Literal["ortho", "dem"],
-    resolution: float | None,
-    water: bool,
-    bars: Callable[[str, int, int], None],
-) -> tuple[str, dict[str, Any]]:
+def _survey(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
     from aquaflow.survey.export.ortho.survey import export_survey
 
-    survey = export_survey(dive, folder, kind, resolution, water, bars)
-    ground, names = survey.ground, " and ".join(str(path) for path in survey.files)
-    said = [
-        f"Wrote {names}: {survey.width} x {survey.height} pixels of {survey.resolution:g} "
-        f"{ground.unit}, {survey.covered:.0%} mapped.",
-        f"Coordinates: {ground.axes}. Vertical: {ground.vertical}.",
-    ]
-    if kind == "dem":
-        said.append(f"Heights are above {ground.height_zero}, {ground.unit}.")
-    elif survey.water_range is not None:
-        said.append(f"Seen through {survey.water_range:.3g} {ground.unit} of water.")
-    return "\n".join(said), {
-        "files": [str(path) for path in survey.files],
-        "width": survey.width, "height": survey.height, "resolution": survey.resolution,
-        "covered": survey.covered, "unit": ground.unit, "epsg": ground.epsg,
-        "axes": ground.axes, "vertical": ground.vertical, "height_zero": ground.height_zero,
-        "water_range": survey.water_range,
-    }  # fmt: skip
+    targets = {RASTERS[each]: path for each, path in together.items()}
+    survey = export_survey(job.dive, targets, job.resolution, job.water, job.bars)
+    made: Made = {}
+    ground = survey.ground
+    for each in together:
+        files = [str(file) for file in survey.files[RASTERS[each]]]
+        is_dem = each is ExportFormat.dem
+        through = None if is_dem else survey.water_range
+        said = [
+            f"Wrote {' and '.join(files)}: {survey.width} x {survey.height} pixels of "
+            f"{survey.resolution:g} {ground.unit}, {survey.covered:.0%} mapped.",
+            f"Coordinates: {ground.axes}. Vertical: {ground.vertical}.",
+        ]
+        if is_dem:
+            said.append(f"Heights are above {ground.height_zero}, {ground.unit}.")
+        elif through is not None:
+            said.append(f"Seen through {through:.3g} {ground.unit} of water.")
+        made[each] = "\n".join(said), {
+            "files": files,
+            "width": survey.width, "height": survey.height, "resolution": survey.resolution,
+            "covered": survey.covered, "unit": ground.unit, "epsg": ground.epsg,
+            "axes": ground.axes, "vertical": ground.vertical, "height_zero": ground.height_zero,
+            "water_range": through,
+        }  # fmt: skip
+    return made
 
 
 # --------------------------------------------------------------------------------------------------
@@ -426,14 +525,15 @@ def video(
         elif kind is VideoKind.side_by_side:
             from aquaflow.survey.video.every_frame import side_by_side
 
-            count = side_by_side(read, out, recording, progress)
+            count = side_by_side(read, out, recording or read.recording, progress)
             said, facts = f"Wrote {count} frames side by side to {out}.", {"frames": count}
         else:
             from aquaflow.survey.video.every_frame import restore_every_frame
 
-            if recording is None:
+            source = recording or read.recording
+            if source is None:
                 raise InputError("--kind restored needs --recording: a dive keeps no pictures")
-            wrote = restore_every_frame(read, out, recording, width, progress)
+            wrote = restore_every_frame(read, out, source, width, progress)
             said = f"Wrote {wrote.frames} frames to {out}, {wrote.restored} of them restored."
             facts = {"frames": wrote.frames, "restored": wrote.restored}
     typer.echo(json.dumps({"out": str(out), **facts}) if as_json else said)

@@ -117,6 +117,17 @@ class Dive:
         return found
 
     @property
+    def recording(self) -> Path | None:
+        """What was mapped, if it still lies where it did.
+
+        Raises:
+            InputError: metrics.json is damaged.
+        """
+        stated = self.facts(METRICS).get("recording")
+        path = Path(stated) if isinstance(stated, str) and stated else None
+        return path if path is not None and path.exists() else None
+
+    @property
     def status(self) -> DiveStatus | None:
         """How the dive stands at the moment; None where nothing readable says so."""
         return read_status(self.path)

@@ -52,8 +52,10 @@ def map_recording(
     telemetry: TelemetryInput | None = None,
     settle: Callable[[], None] = lambda: None,
     base: Base | None = None,
+    path: Path | None = None,
 ) -> Finished:
     """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
+    ``path``: where the recording lies, for the dive to remember.
 
     ``settle`` is called at the end of each stage: a benchmark lets it wait for a GPU.
 
@@ -73,6 +75,7 @@ def map_recording(
         slam = Slam(config, Stages(Profiler(trace, settle), failures), folder.work)
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
+        run.recording = path
         try:
             if base is not None:
                 slam.localise_in(base)

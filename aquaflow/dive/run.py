@@ -92,6 +92,8 @@ class DiveRun:
         """The camera of a dive without calibration, as far as its own pictures show it."""
         self.sources: dict[str, str] = {}
         """A sentence on each of what was read of a recording: times, calibration, white."""
+        self.recording: Path | None = None
+        """What is mapped, for who wants its pictures again; None where that is no file."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
         self.telemetry_log: TelemetryWriter | None = None
@@ -415,6 +417,7 @@ class DiveRun:
         in_base = self.slam.in_base
         numbers["in_site"] = None if in_base is None else in_site_numbers(in_base)
         numbers["sources"] = self.sources
+        numbers["recording"] = None if self.recording is None else str(self.recording.absolute())
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

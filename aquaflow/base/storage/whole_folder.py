@@ -47,6 +47,21 @@ def whole_folder(path: Path) -> Iterator[Path]:
         _publish(made, path)
 
 
+@contextmanager
+def whole_files(path: Path) -> Iterator[Path]:
+    """As :func:`whole_folder`, of files that shall lie beside ``path``, one of them: in a folder
+    that keeps its others.
+
+    Raises:
+        InputError: they cannot be written.
+    """
+    path = path.resolve()
+    remove_abandoned(path.parent, path.name)
+    with working_folder(path.parent, path.name) as work, explain_refusal(path):
+        yield work
+        _publish(work, path.parent)
+
+
 def _publish(made: Path, path: Path) -> None:
     try:
         made.rename(path)  # to where there is nothing, or an empty folder

@@ -56,8 +56,9 @@ def map_one(asked: dict[str, Any]) -> dict[str, Any]:
     from aquaflow.dive.replay import map_recording  # loads torch
 
     finished = map_recording(
-        recording, source.name, Path(asked["out"]), settings, calibration, telemetry=given
-    )
+        recording, source.name, Path(asked["out"]), settings, calibration, telemetry=given,
+        path=source,
+    )  # fmt: skip
     metrics = finished.metrics
     return {
         "state": "poor" if finished.warnings else "done",

@@ -66,9 +66,9 @@ def few_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def written(dive: Path) -> dict[str, Path]:
     paths = {kind: dive / f"mesh.{kind}" for kind in KINDS}
-    export_mesh(Dive(dive), paths["ply"], "ply")
-    export_mesh(Dive(dive), paths["obj"], "obj", TEXTURED_M)
-    export_mesh(Dive(dive), paths["glb"], "glb", TEXTURED_M)
+    export_mesh(Dive(dive), {"ply": paths["ply"]})
+    export_mesh(Dive(dive), {"obj": paths["obj"]}, TEXTURED_M)
+    export_mesh(Dive(dive), {"glb": paths["glb"]}, TEXTURED_M)
     return paths
 
 
@@ -129,7 +129,7 @@ def test_the_same_dive_gives_the_same_bytes(few_views: Path, tmp_path: Path) -> 
     for folder in (once, again):
         folder.mkdir()
         for kind in KINDS:
-            export_mesh(Dive(few_views), folder / f"mesh.{kind}", kind, 0.1)  # type: ignore[arg-type]
+            export_mesh(Dive(few_views), {kind: folder / f"mesh.{kind}"}, 0.1)  # type: ignore[arg-type]
     names = ["mesh.glb", "mesh.mtl", "mesh.obj", "mesh.ply", "mesh.png"]
     assert sorted(path.name for path in once.iterdir()) == names
     for name in names:
@@ -138,7 +138,7 @@ def test_the_same_dive_gives_the_same_bytes(few_views: Path, tmp_path: Path) -> 
 
 def test_a_dive_on_the_earth_lies_on_its_utm_grid(tmp_path: Path) -> None:
     dive = write_survey(tmp_path / "dive", surveyed())
-    mesh = export_mesh(Dive(dive), tmp_path / "a.glb", "glb", resolution=0.04)
+    mesh = export_mesh(Dive(dive), {"glb": tmp_path / "a.glb"}, resolution=0.04)
     _, vertices = read(tmp_path / "a.glb")
     north, east = (each.ravel() for each in np.meshgrid(*[np.linspace(0.8, 3.0, 12)] * 2))
     truth = on_utm(np.column_stack([north, east, DEPTH_M - height(north, east)]))
@@ -177,10 +177,10 @@ def test_a_dive_in_map_units_says_so_and_water_colours_it(tmp_path: Path) -> Non
     mapper = surveyed(metric_frame(T_nm=Sim3.identity()))
     mapper.medium.set_water(*(torch.tensor(values) for values in WATER))
     dive = write_survey(tmp_path / "dive", mapper, WorldFrame.unknown())
-    clear = export_mesh(Dive(dive), tmp_path / "clear.ply", "ply", 0.06)
+    clear = export_mesh(Dive(dive), {"ply": tmp_path / "clear.ply"}, 0.06)
     assert clear.where.unit == "map units"
     assert clear.seen == "without water"
-    seen = export_mesh(Dive(dive), tmp_path / "seen.ply", "ply", 0.06, water=True)
+    seen = export_mesh(Dive(dive), {"ply": tmp_path / "seen.ply"}, 0.06, water=True)
     assert seen.seen.endswith("map units of water")
     means = []
     for name in ("clear", "seen"):
@@ -192,7 +192,7 @@ def test_a_dive_in_map_units_says_so_and_water_colours_it(tmp_path: Path) -> Non
 
 
 def test_a_larger_resolution_gives_fewer_triangles(dive: Path, tmp_path: Path) -> None:
-    coarse = export_mesh(Dive(dive), tmp_path / "a.ply", "ply", resolution=0.08)
+    coarse = export_mesh(Dive(dive), {"ply": tmp_path / "a.ply"}, resolution=0.08)
     assert coarse.voxel == 0.08
     _, vertices = read(tmp_path / "a.ply")
     error = vertices[:, 2] - height(vertices[:, 1], vertices[:, 0]) + DEPTH_M
@@ -202,7 +202,7 @@ def test_a_larger_resolution_gives_fewer_triangles(dive: Path, tmp_path: Path) -
 
 def test_a_surface_of_few_voxels_is_written(dive: Path, tmp_path: Path) -> None:
     fine, coarse, coarser = (
-        export_mesh(Dive(dive), tmp_path / "a.ply", "ply", resolution)
+        export_mesh(Dive(dive), {"ply": tmp_path / "a.ply"}, resolution)
         for resolution in (0.08, 0.2, 0.4)
     )
     assert coarser.triangles > 0
@@ -223,14 +223,14 @@ def test_what_fails_leaves_nothing_behind(
         interrupted,
     )
     with pytest.raises(KeyboardInterrupt):
-        export_mesh(Dive(few_views), tmp_path / f"a.{kind}", kind, 0.1)  # type: ignore[arg-type]
+        export_mesh(Dive(few_views), {kind: tmp_path / f"a.{kind}"}, 0.1)  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_a_file_is_refused_in_a_sentence(dive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="give a folder with room"):
-        export_mesh(Dive(dive), tmp_path / "file" / "a.ply", "ply")
+        export_mesh(Dive(dive), {"ply": tmp_path / "file" / "a.ply"})
 
 
 def test_a_dive_without_gaussians_views_or_surface_is_one_sentence(
@@ -240,17 +240,17 @@ def test_a_dive_without_gaussians_views_or_surface_is_one_sentence(
     write_small_dive(dive)
     monkeypatch.setattr(export_module, "LEAST_VIEWS", 9)
     with pytest.raises(InputError, match="too little of the map is seen well by two views"):
-        export_mesh(Dive(dive), tmp_path / "a.ply", "ply")
+        export_mesh(Dive(dive), {"ply": tmp_path / "a.ply"})
     mapper = small_mapper()
     mapper.views = []
     write_map_file(dive / "map.aqf", mapper)
     with pytest.raises(InputError, match="has no views"):
-        export_mesh(Dive(dive), tmp_path / "a.ply", "ply")
+        export_mesh(Dive(dive), {"ply": tmp_path / "a.ply"})
     mapper = small_mapper()
     mapper.gaussians.parameters["opacity_logits"].fill_(-9.0)
     write_map_file(dive / "map.aqf", mapper)
     with pytest.raises(InputError, match="show no surface of its map"):
-        export_mesh(Dive(dive), tmp_path / "a.ply", "ply")
+        export_mesh(Dive(dive), {"ply": tmp_path / "a.ply"})
     assert not list(tmp_path.glob("*.ply"))
 
 
@@ -260,7 +260,7 @@ def test_a_missing_package_is_named_with_what_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=rf"{module}.*pip install 'aquaflow\[survey\]'"):
-        export_mesh(Dive(dive), tmp_path / "a", kind)  # type: ignore[arg-type]
+        export_mesh(Dive(dive), {kind: tmp_path / "a"})  # type: ignore[arg-type]
 
 
 def test_the_command_writes_into_the_dive_and_says_what_it_is(dive: Path) -> None:

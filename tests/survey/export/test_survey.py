@@ -83,7 +83,7 @@ def tags(path: Path) -> dict[str, str]:
 
 
 def test_heights_and_places_are_those_of_the_ground(dive: Path, tmp_path: Path) -> None:
-    export_survey(Dive(dive), tmp_path, "dem")
+    export_survey(Dive(dive), {"dem": tmp_path})
     bands, dataset = read(tmp_path / "dem.tif")
     assert dataset.crs.to_epsg() == UTM_32
     north, east = ground_points()
@@ -110,7 +110,7 @@ def test_stated_heights_hold_the_truth_and_are_wider_where_the_map_is_rough(
     north, east = ground_points()
     sigmas = []
     for number, dive in enumerate((local_dive, write_survey(tmp_path / "dive", rough, frame))):
-        export_survey(Dive(dive), tmp_path / str(number), "dem")
+        export_survey(Dive(dive), {"dem": tmp_path / str(number)})
         bands, dataset = read(tmp_path / str(number) / "dem.tif")
         found, sigma = (at(band, dataset, np.column_stack([east, north])) for band in bands[:2])
         if dive == local_dive:
@@ -123,7 +123,7 @@ def test_stated_heights_hold_the_truth_and_are_wider_where_the_map_is_rough(
 
 
 def test_colours_lie_where_the_ground_has_them(dive: Path, tmp_path: Path) -> None:
-    export_survey(Dive(dive), tmp_path, "ortho")
+    export_survey(Dive(dive), {"ortho": tmp_path})
     bands, dataset = read(tmp_path / "ortho.tif")
     north, east = ground_points()
     places = on_utm(np.column_stack([north, east, DEPTH_M - height(north, east)]))
@@ -133,11 +133,11 @@ def test_colours_lie_where_the_ground_has_them(dive: Path, tmp_path: Path) -> No
 
 
 def test_tiles_leave_no_seams(dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    export_survey(Dive(dive), tmp_path / "whole", "ortho")
+    export_survey(Dive(dive), {"ortho": tmp_path / "whole"})
     monkeypatch.setattr(grid_module, "TILE_PX", 48)
     steps: list[tuple[str, int, int]] = []
     export_survey(
-        Dive(dive), tmp_path / "tiled", "ortho", progress=lambda *step: steps.append(step)
+        Dive(dive), {"ortho": tmp_path / "tiled"}, progress=lambda *step: steps.append(step)
     )
     whole, tiled = (read(tmp_path / name / "ortho.tif")[0] for name in ("whole", "tiled"))
     assert steps[-1][0] == "tiles"
@@ -148,7 +148,7 @@ def test_tiles_leave_no_seams(dive: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_coarser_raster_has_the_same_heights(local_dive: Path, tmp_path: Path) -> None:
-    survey = export_survey(Dive(local_dive), tmp_path, "dem", resolution=0.05)
+    survey = export_survey(Dive(local_dive), {"dem": tmp_path}, resolution=0.05)
     bands, dataset = read(tmp_path / "dem.tif")
     assert dataset.res == (0.05, 0.05)
     assert survey.resolution == 0.05
@@ -160,7 +160,7 @@ def test_a_coarser_raster_has_the_same_heights(local_dive: Path, tmp_path: Path)
 
 def test_holes_are_nodata_and_transparent(dive: Path, tmp_path: Path) -> None:
     for kind in ("ortho", "dem"):
-        survey = export_survey(Dive(dive), tmp_path, kind)  # type: ignore[arg-type]
+        survey = export_survey(Dive(dive), {kind: tmp_path})  # type: ignore[arg-type]
         assert 0.3 < survey.covered < 1.0
     heights, dem = read(tmp_path / "dem.tif")
     colours, _ = read(tmp_path / "ortho.tif")
@@ -177,25 +177,25 @@ def test_holes_are_nodata_and_transparent(dive: Path, tmp_path: Path) -> None:
 
 
 def test_files_are_cloud_optimised_and_say_what_they_are(dive: Path, tmp_path: Path) -> None:
-    survey = export_survey(Dive(dive), tmp_path, "ortho", resolution=0.005)
-    assert [path.name for path in survey.files] == ["ortho.tif", "ortho_quality.tif"]
+    survey = export_survey(Dive(dive), {"ortho": tmp_path}, resolution=0.005)
+    assert [path.name for path in survey.files["ortho"]] == ["ortho.tif", "ortho_quality.tif"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ortho.tif", "ortho_quality.tif"]
-    for path in survey.files:
+    for path in survey.files["ortho"]:
         with rasterio.open(path) as dataset:
             assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
             assert dataset.block_shapes[0] == (512, 512)
             assert dataset.overviews(1)
             assert all(dataset.descriptions)
-    with rasterio.open(survey.files[0]) as dataset:
+    with rasterio.open(survey.files["ortho"][0]) as dataset:
         assert [each.name for each in dataset.colorinterp] == ["red", "green", "blue", "alpha"]
-    said = tags(survey.files[0])
+    said = tags(survey.files["ortho"][0])
     assert said["VERTICAL"] == "along gravity"
     assert said["COLOURS"] == "without water"
     assert "poses are taken as exact" in said["SIGMA"]
 
 
 def test_a_dive_without_a_place_lies_in_local_metres(local_dive: Path, tmp_path: Path) -> None:
-    survey = export_survey(Dive(local_dive), tmp_path, "dem")
+    survey = export_survey(Dive(local_dive), {"dem": tmp_path})
     _, dataset = read(tmp_path / "dem.tif")
     assert survey.ground.epsg is None
     assert dataset.crs.to_epsg() is None
@@ -207,7 +207,7 @@ def test_a_dive_without_metres_and_gravity_says_so(tmp_path: Path) -> None:
     frame = WorldFrame.unknown()
     upright = metric_frame(T_nm=Sim3.identity())
     survey = export_survey(
-        Dive(write_survey(tmp_path / "d", surveyed(upright), frame)), tmp_path, "dem"
+        Dive(write_survey(tmp_path / "d", surveyed(upright), frame)), {"dem": tmp_path}
     )
     bands, dataset = read(tmp_path / "dem.tif")
     assert dataset.crs is None
@@ -228,7 +228,7 @@ def test_views_that_look_all_around_have_no_vertical(tmp_path: Path) -> None:
         view.T_wc = Sim3(turn.R @ LOOKS_DOWN, view.T_wc.t)
     dive = write_survey(tmp_path / "d", mapper, WorldFrame.unknown())
     with pytest.raises(InputError, match="says which way is down"):
-        export_survey(Dive(dive), tmp_path, "dem")
+        export_survey(Dive(dive), {"dem": tmp_path})
 
 
 def test_with_water_the_ground_is_seen_from_the_median_range(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_with_water_the_ground_is_seen_from_the_median_range(tmp_path: Path) -> 
     murk = [torch.tensor(v) for v in ((0.5, 0.3, 0.2), (0.1, 0.25, 0.3), (0.5, 0.4, 0.3))]
     mapper.medium.set_water(*murk)
     dive = write_survey(tmp_path / "d", mapper)
-    survey = export_survey(Dive(dive), tmp_path, "ortho", water=True)
+    survey = export_survey(Dive(dive), {"ortho": tmp_path}, water=True)
     assert survey.water_range == pytest.approx(ALTITUDE_M, rel=0.1)
     bands, dataset = read(tmp_path / "ortho.tif")
     assert "of water" in tags(tmp_path / "ortho.tif")["COLOURS"]
@@ -253,14 +253,14 @@ def test_with_water_the_ground_is_seen_from_the_median_range(tmp_path: Path) -> 
 
 def test_too_many_pixels_are_refused(dive: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="coarser --resolution"):
-        export_survey(Dive(dive), tmp_path, "dem", resolution=1e-6)
+        export_survey(Dive(dive), {"dem": tmp_path}, resolution=1e-6)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused(dive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match="give a folder with room"):
-        export_survey(Dive(dive), tmp_path / "file" / "out", "dem")
+        export_survey(Dive(dive), {"dem": tmp_path / "file" / "out"})
 
 
 def test_without_rasterio_one_sentence_says_what_to_install(
@@ -268,7 +268,7 @@ def test_without_rasterio_one_sentence_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(InputError, match=r"pip install 'aquaflow\[survey\]'"):
-        export_survey(Dive(dive), tmp_path, "dem")
+        export_survey(Dive(dive), {"dem": tmp_path})
 
 
 def test_the_command_prints_one_object(dive: Path, tmp_path: Path) -> None:
@@ -314,11 +314,11 @@ def test_a_dive_with_an_empty_map_is_refused(tmp_path: Path) -> None:
     mapper.views = []
     dive = write_survey(tmp_path / "d", mapper)
     with pytest.raises(InputError, match="is empty"):
-        export_survey(Dive(dive), tmp_path, "dem")
+        export_survey(Dive(dive), {"dem": tmp_path})
 
 
 def test_a_frame_that_is_not_metric_keeps_its_unit(tmp_path: Path) -> None:
     frame = replace(metric_frame(**LOCAL), metric=False)
-    survey = export_survey(Dive(write_survey(tmp_path / "d", surveyed(), frame)), tmp_path, "dem")
+    survey = export_survey(Dive(write_survey(tmp_path / "d", surveyed(), frame)), {"dem": tmp_path})
     assert survey.ground.unit == "map units"
     assert survey.ground.vertical == "along gravity"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,7 +49,7 @@ median range: what is smaller is haze or a fish, however coarse the mesh is want
 class WrittenMesh:
     """What was written."""
 
-    files: list[Path]
+    files: dict[Kind, list[Path]]
     vertices: int
     triangles: int
     area: float
@@ -79,13 +79,13 @@ class FusedSurface:
 
 def export_mesh(
     dive: Dive,
-    path: Path,
-    kind: Kind,
+    targets: Mapping[Kind, Path],
     resolution: float | None = None,
     water: bool = False,
     progress: Progress | None = None,
 ) -> WrittenMesh:
-    """Write the surface of the dive's largest sub-map; of ``obj`` also .mtl and .png beside it.
+    """Write the surface of the dive's largest sub-map, to the file that each of ``targets`` names;
+    of ``obj`` also .mtl and .png beside it.
 
     Args:
         resolution: side of a voxel, m, or map units where the dive has no metres; None: two pixels
@@ -98,7 +98,7 @@ def export_mesh(
         ConfigError: the dive's settings cannot be read.
     """
     require_marching_cubes()
-    if kind != "ply":
+    if targets.keys() != {"ply"}:
         load("xatlas", "a textured mesh", "survey")
     mapper, frame = dive.map(), dive.frame
     posed, where = read_posed_views(dive, mapper)
@@ -106,7 +106,9 @@ def export_mesh(
         raise InputError(f"the map of {dive} is empty; map a recording that shows more")
     scale, report = frame.T_nm.scale, progress or _nothing
     drawn = drawn_surfaces(mapper, scale)
-    views = ViewSurfaces(posed, drawn, path.parent, partial(report, "views"))
+    views = ViewSurfaces(
+        posed, drawn, next(iter(targets.values())).parent, partial(report, "views")
+    )
     surface = fused_surface(
         views, resolution or round_to_digits(VOXEL_PX * views.footprint), report
     )
@@ -120,29 +122,25 @@ def export_mesh(
 
     seen = "without water" if through is None else f"through {through:.3g} {where.unit} of water"
     placed = _place_mesh(surface, where, seen)
-    files, size = [path], None
-    if kind == "ply":
-        vertices = surface.mesh.vertices
-        found = [colour(vertices[part])[0] for part in batches(len(vertices))]
-        write_mesh_ply(path, placed, np.concatenate(found))
-    else:
+    files = {kind: [path] for kind, path in targets.items()}
+    texture = None
+    if targets.keys() != {"ply"}:
         layout = lay_out(surface.mesh, surface.voxel / VOXEL_PX)
-        picture = paint(surface.mesh, layout, colour, partial(report, "texture"))
-        files = _write_textured(path, kind, placed, Texture(layout, picture))
-        size = (layout.width, layout.height)
+        texture = Texture(layout, paint(surface.mesh, layout, colour, partial(report, "texture")))
+    for kind, path in targets.items():
+        if texture is not None and kind == "obj":
+            files[kind] = write_obj(path, placed, texture)
+        elif texture is not None and kind == "glb":
+            write_glb(path, placed, texture)
+        else:
+            vertices = surface.mesh.vertices
+            found = [colour(vertices[part])[0] for part in batches(len(vertices))]
+            write_mesh_ply(path, placed, np.concatenate(found))
+    size = None if texture is None else (texture.layout.width, texture.layout.height)
     return WrittenMesh(
         files, len(surface.mesh.vertices), len(surface.mesh.faces), surface.mesh.area(),
         surface.voxel, float(np.median(surface.sigma)), size, where, placed.origin, seen,
     )  # fmt: skip
-
-
-def _write_textured(
-    path: Path, kind: Literal["obj", "glb"], placed: PlacedMesh, texture: Texture
-) -> list[Path]:
-    if kind == "obj":
-        return write_obj(path, placed, texture)
-    write_glb(path, placed, texture)
-    return [path]
 
 
 def _nothing(what: str, done: int, total: int) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow import __version__
-from aquaflow.base.storage.whole_folder import whole_folder
+from aquaflow.base.storage.whole_folder import whole_files, whole_folder
 from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, Colours, GroundSplats
@@ -25,6 +25,7 @@ from aquaflow.survey.export.ortho.grid import (
     QUALITY,
     Grid,
     GridTile,
+    MapLayer,
     TilePixels,
     round_to_digits,
 )
@@ -38,8 +39,9 @@ Kind = Literal["ortho", "dem"]
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it, and how much there is."""
 
-LAYERS = {"ortho": (ORTHO, QUALITY), "dem": (DEM,)}
+LAYERS: dict[Kind, tuple[MapLayer, ...]] = {"ortho": (ORTHO, QUALITY), "dem": (DEM,)}
 """Files of each kind."""
+ENDING = ".tif"
 HEIGHT_SIGMA_PX = 0.5
 """1 sigma of where a view shows a point, for heights. What is missing to one pixel
 (sightings.PICTURE_SIGMA_PX) moves whole views, and hardly the heights between them."""
@@ -59,7 +61,7 @@ SIGMA_IS = (
 class SurveyFiles:
     """What was written."""
 
-    files: list[Path]
+    files: dict[Kind, list[Path]]
     width: int
     height: int
     """Pixels."""
@@ -74,15 +76,16 @@ class SurveyFiles:
 
 def export_survey(
     dive: Dive,
-    out: Path,
-    kind: Kind,
+    targets: Mapping[Kind, Path],
     resolution: float | None = None,
     water: bool = False,
     progress: Progress | None = None,
 ) -> SurveyFiles:
-    """Write the ortho or the elevations of the dive's largest sub-map into the folder ``out``.
+    """Write the ortho, the elevations or both of the dive's largest sub-map.
 
     Args:
+        targets: of each kind: a folder, or its file if that ends in .tif; other files of the kind
+            are beside it, NAME_quality.tif for one.
         resolution: side of a pixel, m, or map units where the dive has no metres; None: what a
             pixel of the mapped pictures shows, median.
         water: of an ortho: with the water, as seen from the views' median range.
@@ -96,31 +99,55 @@ def export_survey(
     mapper, frame = dive.filled_map(), dive.frame
     shown = ShownViews(mapper)
     ground = ground_of(frame, shown)
-    ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
+    work = next(iter(targets.values())).parent
+    ranges = ViewRanges(mapper, ground, work, progress and partial(progress, "views"))
     side = resolution or round_to_digits(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
     grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
     through = ranges.median_range if water and mapper.medium.active else None
-    colours = Colours(mapper, ground.T_gm.scale, through) if kind == "ortho" else None
+    colours = Colours(mapper, ground.T_gm.scale, through) if "ortho" in targets else None
     looked = _Tiles(grid, GroundSplats(shown, ground), ranges, colours)
-    tags = _tags(dive, frame, ground, side, through, colours is not None)
+    layers = {kind: _named(kind, path) for kind, path in targets.items()}
     covered = 0
-    with whole_folder(out) as made, ExitStack() as files:
-        rasters = [
-            files.enter_context(writing_raster(made, layer, grid, ground, tags))
-            for layer in LAYERS[kind]
-        ]
+    with ExitStack() as files:
+        rasters = []
+        for kind, path in targets.items():
+            made = files.enter_context(_whole(path))
+            tags = _tags(dive, frame, ground, side, through, kind == "ortho")
+            for layer in layers[kind]:
+                raster = files.enter_context(writing_raster(made, layer, grid, ground, tags))
+                rasters.append((layer, raster))
         for done, tile in enumerate(grid.tiles()):
             pixels = looked.at(tile)
             if pixels is not None:
                 covered += int(pixels.mapped.sum())
-                for layer, raster in zip(LAYERS[kind], rasters, strict=True):
+                for layer, raster in rasters:
                     raster.write(tile, layer.values(pixels))
             if progress is not None:
                 progress("tiles", done + 1, grid.tile_count)
     share = covered / (grid.width * grid.height)
-    paths = [out / layer.name for layer in LAYERS[kind]]
+    paths = {
+        kind: [(path.parent if _is_file(path) else path) / layer.name for layer in layers[kind]]
+        for kind, path in targets.items()
+    }
     return SurveyFiles(paths, grid.width, grid.height, side, share, ground, through)
+
+
+def _is_file(target: Path) -> bool:
+    return target.suffix.lower() == ENDING
+
+
+def _whole(target: Path) -> AbstractContextManager[Path]:
+    return whole_files(target) if _is_file(target) else whole_folder(target)
+
+
+def _named(kind: Kind, target: Path) -> list[MapLayer]:
+    """The layers of a kind; named as ``target`` is, if it is a file."""
+    if not _is_file(target):
+        return list(LAYERS[kind])
+    first, *others = LAYERS[kind]
+    named = [replace(each, name=each.name.replace(kind, target.stem, 1)) for each in others]
+    return [replace(first, name=target.name), *named]
 
 
 @dataclass(frozen=True)
