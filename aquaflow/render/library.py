@@ -37,6 +37,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_decode_view_backward": (_INT, [_POINTER, _INT, _POINTER]),
     "aq_check_flow": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT] * 3 + [_POINTER] * 2),
     "aq_fuse_depths": (_INT, [_POINTER]),
+    "aq_fuse_ranges": (_INT, [_POINTER]),
     "aq_pose_equations": (_INT, [_POINTER] * 3),
     "aq_refine_flow": (
         _INT,

@@ -258,7 +258,8 @@ def scratch_array(folder: Path, shape: tuple[int, ...], dtype: npt.DTypeLike) ->
             f"cannot write to {folder}: {error.strerror or error}; give a folder with room that "
             "can be written to"
         ) from error
-    return flat[: math.prod(shape)].reshape(shape)
+    # As a plain array: each time that a memmap is indexed costs as much as thousands of values.
+    return flat[: math.prod(shape)].reshape(shape).view(np.ndarray)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@
 #include "decode_view.h"
 #include "decode_view_backward.h"
 #include "fuse_depths.h"
+#include "fuse_ranges.h"
 #include "image_formation.h"
 #include "photometric.h"
 #include "pool.h"
@@ -256,6 +257,12 @@ AQ_EXPORT int aq_check_flow(const float* forward, const float* backward, const f
 
 // See fuse_depths.h. Returns the number of pixels with a usable measurement.
 AQ_EXPORT int aq_fuse_depths(const FuseDepths* in) { return fuse_depths(*in); }
+
+// See fuse_ranges.h: distances of places from the surface that one view shows.
+AQ_EXPORT int aq_fuse_ranges(const FuseRanges* in) {
+  fuse_ranges(*in);
+  return 0;
+}
 
 // See pose_equations.h: cost and normal equations, and, unless ``left`` is null, what is left.
 AQ_EXPORT int aq_pose_equations(const PoseEquations* in, PoseResult* out, const PoseLeft* left) {

@@ -234,6 +234,34 @@ static void match(const Scene& s, bool short_of_memory) {
   const int measured = aq_fuse_depths(&in);
   if (measured < 0 || (size_t)measured > pixels) std::exit(4);
 
+  // Places in front of, behind and beside the camera, and wild ones.
+  const int64_t place_count = (int64_t)(pixels / 3);
+  std::vector<double> total(pixels), weights(pixels), around(rho);
+  std::vector<int32_t> near(pixels);
+  for (size_t i = 2; i < pixels; i += 3) around[i] = 0.01 * (double)(i % 700) - 1.0;
+  FuseRanges ranges{around.data(),
+                    flow.data(),
+                    confidence.data(),
+                    confidence.data(),
+                    total.data(),
+                    weights.data(),
+                    near.data(),
+                    place_count,
+                    s.width,
+                    s.height,
+                    50.0,
+                    50.0,
+                    26.0,
+                    20.0,
+                    {1, 0, 0, 0, 1, 0, 0, 0, 1},
+                    {0.1, 0.0, 0.02},
+                    0.03,
+                    10.0,
+                    3.0,
+                    0.09,
+                    0.18};
+  aq_fuse_ranges(&ranges);
+
   // Wild depths and matches; more of them than a block holds.
   const int count = (int)pixels;
   const double* wild_values = rho.data();

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.render.library import library_or_none
 from aquaflow.survey.export.mesh import atlas as colouring
 from aquaflow.survey.export.mesh import blocks as blocks_module
-from aquaflow.survey.export.mesh.atlas import lay_out, look_at, paint
+from aquaflow.survey.export.mesh.atlas import lay_out, look_at, paint, place_sigmas
 from aquaflow.survey.export.mesh.blocks import Blocks, truncation
+from aquaflow.survey.export.mesh.surface import DistanceSums, add_by_numpy, add_compiled
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from tests.survey.export.mesh_scenes import (
     FAR_CAMERA,
@@ -117,25 +119,49 @@ def test_small_pieces_go_and_large_ones_stay() -> None:
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     both = TriangleMesh(np.vstack([square, 0.1 * square + 5.0]), np.vstack([faces, faces + 4]))
-    left = both.without_small_pieces(0.5)
+    left, kept = both.without_small_pieces(0.5)
+    np.testing.assert_array_equal(kept, [0, 1, 2, 3])
     np.testing.assert_array_equal(left.vertices, square)
     np.testing.assert_array_equal(left.faces, faces)
-    assert len(both.without_small_pieces(0.001).faces) == 4
-    assert not len(both.without_small_pieces(2.0).faces)
+    assert len(both.without_small_pieces(0.001)[0].faces) == 4
+    assert not len(both.without_small_pieces(2.0)[0].faces)
 
 
 def test_the_sigma_of_a_place_is_what_rays_of_one_pixel_leave_open(tmp_path: Path) -> None:
     poses = above_plane()
     surfaces = surfaces_of(poses, [to_plane] * 5, tmp_path)
-    seen = look_at(surfaces, np.array([[0.0, 0.1, 0.0], [9.0, 9.0, 0.0]]), VOXEL)
-    assert not np.isfinite(seen.sigma[1])
-    assert not np.isfinite(seen.nearest[1])
+    places = np.array([[0.0, 0.1, 0.0], [9.0, 9.0, 0.0]])
+    sigma, sigma_px = place_sigmas(surfaces, places, VOXEL)
     # Five rays within 0.3 of each other from 2 above: a pixel is 0.02, the height worse.
-    assert 0.02 < seen.sigma[0] < 0.12
+    assert 0.02 < sigma[0] < 0.12
+    assert sigma_px[0] == pytest.approx(sigma[0] / 0.02, rel=0.1)
+    assert np.isinf([sigma[1], sigma_px[1]]).all()
+    seen = look_at(surfaces, places, VOXEL)
+    assert np.isinf(seen.nearest[1])
     np.testing.assert_allclose(seen.radiance[0], [0.5, 0.6, 0.5], atol=0.02)
-    one = look_at(surfaces_of(poses[:1], [to_plane], tmp_path), np.zeros((1, 3)), VOXEL)
-    assert one.sigma[0] > 1e3
-    assert np.isfinite(one.nearest[0])
+    alone = surfaces_of(poses[:1], [to_plane], tmp_path)
+    assert place_sigmas(alone, np.zeros((1, 3)), VOXEL)[0] > 1e3
+    assert np.isfinite(look_at(alone, np.zeros((1, 3)), VOXEL).nearest[0])
+
+
+def test_compiled_fusion_finds_what_numpy_finds(tmp_path: Path) -> None:
+    library = library_or_none()
+    if library is None:
+        pytest.skip("no compiled kernels here")
+    surfaces = surfaces_of(above_plane(), [plane_with_hole, *[to_plane] * 4], tmp_path)
+    places = np.random.default_rng(0).uniform((-2.0, -2.0, -0.2), (2.0, 2.0, 2.5), (20000, 3))
+    places[:2] = np.array([[np.nan], [np.inf]])
+    places[2:7] = [view.T_uc.t for view in surfaces.views]
+    expected, found = DistanceSums.of(places), DistanceSums.of(places)
+    for number in range(5):
+        with np.errstate(invalid="ignore"):
+            add_by_numpy(expected, surfaces, number, VOXEL)
+        add_compiled(library, found, surfaces, number, VOXEL)
+    assert expected.near.max() == 5
+    assert (expected.near == 0).sum() > 1000
+    np.testing.assert_array_equal(found.near, expected.near)
+    np.testing.assert_allclose(found.weights, expected.weights, rtol=1e-12)
+    np.testing.assert_allclose(found.total, expected.total, rtol=1e-9, atol=1e-6)
 
 
 def test_too_many_voxels_are_refused_in_a_sentence(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from aquaflow.base.errors import load
 from aquaflow.render.transfers import checkpoint_in
@@ -26,9 +27,9 @@ LARGEST_SIDE = 8192
 """Pixels of a texture: what any desktop's GPU takes (D3D 10 asks for it, OpenGL 4.1 for twice)."""
 FILLED = 0.5
 """Share of a texture that triangles are expected to take; xatlas reaches 0.8 on the reef."""
-GROUP = 2000
-"""Triangles that are laid out together, neighbours in space: for 60 000 of the reef xatlas takes
-1.8 s so, 8.5 s where all are one group, and finds as many charts."""
+GROUP = 500
+"""Triangles that are laid out together, neighbours in space: for 80 000 of the reef xatlas takes
+3.7 CPU s so, 8.2 in groups of 2000, and finds as many charts, on 4 % more pixels."""
 FACES = 1 << 14
 """Triangles whose pixels are found at a time."""
 PADDING_PX = 2
@@ -90,23 +91,38 @@ def paint(
     progress: Callable[[int, int], None] | None = None,
 ) -> npt.NDArray[np.uint8]:
     """The picture [H, W, 3] RGB of the layout, whose pixels have the colours of their places, or
-    those beside it where a place has none."""
+    of the nearest vertex where a place has none."""
     size = (layout.height, layout.width)
-    picture, wanted = np.zeros((*size, 3), np.uint8), np.zeros(size, bool)
-    painted = np.zeros(size, bool)
+    picture, painted = np.zeros((*size, 3), np.uint8), np.zeros(size, bool)
+    missing = []
     for done, (rows, columns, places) in enumerate(_texels(mesh, layout)):
-        wanted[rows, columns] = True
         for part in batches(len(places)):
             found, known = colour(places[part])
             own = rows[part][known], columns[part][known]
             picture[own], painted[own] = found[known], True
+            missing.append(tuple(each[part][~known] for each in (rows, columns, places)))
         if progress is not None:
             progress(done + 1, -(-len(mesh.faces) // FACES))
-    steps = 0
-    while painted.any() and (steps < PADDING_PX or (wanted & ~painted).any()):
+    rows, columns, places = (np.concatenate(each) for each in zip(*missing, strict=True))
+    if painted.any() and len(places):
+        own = rows, columns
+        picture[own], painted[own] = _nearest_colours(mesh, colour, places), True
+    for _ in range(PADDING_PX):
         _grow(picture, painted)
-        steps += 1
     return picture
+
+
+def _nearest_colours(
+    mesh: TriangleMesh,
+    colour: Colour,
+    places: Array,  # [M, 3]
+) -> npt.NDArray[np.uint8]:
+    """RGB [M, 3] of the nearest vertices that have a colour; black if none has."""
+    parts = [colour(mesh.vertices[part]) for part in batches(len(mesh.vertices))]
+    found, known = (np.concatenate(each) for each in zip(*parts, strict=True))
+    if not known.any():
+        return np.zeros((len(places), 3), np.uint8)
+    return np.asarray(found[known][cKDTree(mesh.vertices[known]).query(places)[1]])
 
 
 def _texels(mesh: TriangleMesh, layout: AtlasLayout) -> Iterator[tuple[Integers, Integers, Array]]:
@@ -188,19 +204,6 @@ class ObservedColours:
     """[M, 3] J, the mean of the views, those that are near and see it from the front first."""
     nearest: Array
     """[M] range of the nearest view in the mesh's unit; infinite where none sees the place."""
-    sigma: Array
-    """[M] 1 sigma of the place in the direction that is known least, where rays meet that are each
-    known to PICTURE_SIGMA_PX, in the mesh's unit; infinite of what fewer than two views see."""
-
-    footprint: Array
-    """[M] smallest width of a picture's pixel there, in the mesh's unit; infinite of what none
-    sees."""
-
-    @property
-    def sigma_px(self) -> Array:
-        """[M] sigma in widths of a pixel; infinite where sigma is."""
-        known = np.isfinite(self.sigma)
-        return np.where(known, self.sigma / np.where(known, self.footprint, 1.0), np.inf)
 
 
 def look_at(
@@ -209,36 +212,73 @@ def look_at(
     voxel: float,
 ) -> ObservedColours:
     """How the views see ``places`` of the surface."""
-    count = len(places)
-    total, weights = np.zeros((count, 3)), np.zeros(count)
-    nearest, footprint = np.full(count, np.inf), np.full(count, np.inf)
-    information = np.zeros((count, 3, 3))
+    total, weights = np.zeros((len(places), 3)), np.zeros(len(places))
+    nearest = np.full(len(places), np.inf)
+    for seen in _sightings(surfaces, places, voxel):
+        weight, (row, column) = (seen.cosines / seen.ranges) ** 2, seen.pixels
+        total[seen.which] += weight[:, None] * surfaces.radiance(seen.number)[:, row, column].T
+        weights[seen.which] += weight
+        nearest[seen.which] = np.minimum(nearest[seen.which], seen.ranges)
+    return ObservedColours(total / np.maximum(weights, 1e-30)[:, None], nearest)
+
+
+def place_sigmas(
+    surfaces: ViewSurfaces,
+    places: Array,  # [M, 3]
+    voxel: float,
+) -> tuple[Array, Array]:
+    """How well ``places`` of the surface are known, in the direction that is known least, where
+    rays meet that are each known to PICTURE_SIGMA_PX: [M] 1 sigma in the mesh's unit, and the same
+    in widths of a pixel there, of the nearest view; infinite of what fewer than two views see."""
+    footprint = np.full(len(places), np.inf)
+    information = np.zeros((len(places), 3, 3))
+    for seen in _sightings(surfaces, places, voxel):
+        view = surfaces.views[seen.number]
+        rays = (places[seen.which] - view.T_uc.t) / seen.ranges[:, None]
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        width = seen.ranges / view.camera.fx
+        footprint[seen.which] = np.minimum(footprint[seen.which], width)
+        information[seen.which] += across / ((PICTURE_SIGMA_PX * width) ** 2)[:, None, None]
+    least = np.linalg.eigvalsh(information)[:, 0]
+    known = least > 0.0
+    sigma = np.where(known, 1.0 / np.sqrt(np.where(known, least, 1.0)), np.inf)
+    return sigma, np.where(known, sigma / np.where(known, footprint, 1.0), np.inf)
+
+
+@dataclass(frozen=True)
+class _Sighting:
+    """The places that a view shows, K of them."""
+
+    number: int
+    """Of the view."""
+    which: Integers
+    """[K] numbers of the places."""
+    pixels: tuple[Integers, Integers]
+    """[K] rows and columns."""
+    ranges: Array
+    """[K] of the places from the view."""
+    cosines: Array
+    """[K] of the incidence."""
+
+
+def _sightings(
+    surfaces: ViewSurfaces,
+    places: Array,  # [M, 3]
+    voxel: float,
+) -> Iterator[_Sighting]:
+    """Of each view that may show some of the places."""
     for number in surfaces.around(places.min(axis=0), places.max(axis=0)):
         view, layers = surfaces.views[number], surfaces.surface(number)
-        offset = places - view.T_uc.t
-        local = offset @ view.T_uc.R
-        ahead = np.flatnonzero(view.shows(local))
-        column, row = np.floor(view.camera.project(local[ahead])).astype(np.intp).T
-        ranges = np.linalg.norm(offset[ahead], axis=1)
-        cosine = layers[COSINE][row, column].astype(np.float64)
+        local = (places - view.T_uc.t) @ view.T_uc.R
+        which = np.flatnonzero(view.shows(local))
+        column, row = np.floor(view.camera.project(local[which])).astype(np.intp).T
+        ranges = np.linalg.norm(local[which], axis=1)
+        cosines = layers[COSINE][row, column].astype(np.float64)
         reach = SAME_SURFACE * truncation(layers[SIGMA][row, column], voxel)
         with np.errstate(invalid="ignore"):
-            same = np.abs(layers[RANGE][row, column] - ranges) * cosine <= reach
-        ahead, row, column, ranges = ahead[same], row[same], column[same], ranges[same]
-        weight = (cosine[same] / ranges) ** 2
-        colours = surfaces.radiance(number)[:, row, column].T.astype(np.float64)
-        total[ahead] += weight[:, None] * colours
-        weights[ahead] += weight
-        nearest[ahead] = np.minimum(nearest[ahead], ranges)
-        rays = offset[ahead] / ranges[:, None]
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        width = ranges / view.camera.fx
-        footprint[ahead] = np.minimum(footprint[ahead], width)
-        information[ahead] += across / ((PICTURE_SIGMA_PX * width) ** 2)[:, None, None]
-    least = np.linalg.eigvalsh(information)[:, 0]
-    with np.errstate(divide="ignore"):
-        sigma = np.where(least > 0.0, 1.0 / np.sqrt(np.maximum(least, 0.0)), np.inf)
-    return ObservedColours(total / np.maximum(weights, 1e-30)[:, None], nearest, sigma, footprint)
+            same = np.abs(layers[RANGE][row, column] - ranges) * cosines <= reach
+        pixels = row[same], column[same]
+        yield _Sighting(number, which[same], pixels, ranges[same], cosines[same])
 
 
 def batches(count: int) -> Iterator[slice]:

@@ -17,7 +17,15 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
 from aquaflow.dive.png import encoded_png
 from aquaflow.dive.point_cloud import read_posed_views
-from aquaflow.survey.export.mesh.atlas import batches, lay_out, look_at, paint, shown_colours
+from aquaflow.render.library import library_or_none
+from aquaflow.survey.export.mesh.atlas import (
+    batches,
+    lay_out,
+    look_at,
+    paint,
+    place_sigmas,
+    shown_colours,
+)
 from aquaflow.survey.export.mesh.blocks import Blocks
 from aquaflow.survey.export.mesh.glb import write_glb
 from aquaflow.survey.export.mesh.placed_mesh import PlacedMesh, Texture
@@ -71,7 +79,7 @@ class FusedSurface:
 
     mesh: TriangleMesh
     sigma: Array
-    """[N] of the vertices: :class:`aquaflow.survey.export.mesh.atlas.ObservedColours`."""
+    """[N] of the vertices: :func:`aquaflow.survey.export.mesh.atlas.place_sigmas`."""
     views: ViewSurfaces
     voxel: float
     """Side of a voxel."""
@@ -155,30 +163,31 @@ def fused_surface(views: ViewSurfaces, voxel: float, report: Progress) -> FusedS
     """
     blocks = Blocks(views, voxel, partial(report, "blocks"))
     builder = SurfaceBuilder(voxel)
+    library = library_or_none()
     for done, chunk in enumerate(blocks.chunks()):
-        builder.add(chunk, fuse(views, chunk, voxel, LEAST_VIEWS))
+        builder.add(chunk, fuse(views, chunk, voxel, LEAST_VIEWS, library))
         report("fusion", done + 1, blocks.chunk_count())
     mesh = builder.mesh()
-    known = _sigmas(views, mesh, voxel, in_pixels=True) <= MOST_SIGMA_PX
-    mesh = mesh.with_faces(np.asarray(known[mesh.faces].all(axis=1)))
-    mesh = mesh.without_small_pieces((LEAST_PIECE_PX * views.footprint) ** 2)
+    sigma, sigma_px = _vertex_sigmas(views, mesh, voxel)
+    mesh, kept = mesh.with_faces(np.asarray((sigma_px <= MOST_SIGMA_PX)[mesh.faces].all(axis=1)))
+    sigma = sigma[kept]
+    mesh, kept = mesh.without_small_pieces((LEAST_PIECE_PX * views.footprint) ** 2)
     if not len(mesh.faces):
         raise InputError(
             "too little of the map is seen well by two views to make a surface of it; give a "
             "larger --resolution, or map a recording that shows more"
         )
-    return FusedSurface(mesh, _sigmas(views, mesh, voxel), views, voxel)
+    return FusedSurface(mesh, sigma[kept], views, voxel)
 
 
-def _sigmas(
-    views: ViewSurfaces, mesh: TriangleMesh, voxel: float, in_pixels: bool = False
-) -> Array:
-    """[N] of the vertices, in the mesh's unit, or in widths of a pixel there."""
-    found = [np.empty(0)]
-    for part in batches(len(mesh.vertices)):
-        seen = look_at(views, mesh.vertices[part], voxel)
-        found.append(seen.sigma_px if in_pixels else seen.sigma)
-    return np.concatenate(found)
+def _vertex_sigmas(views: ViewSurfaces, mesh: TriangleMesh, voxel: float) -> tuple[Array, Array]:
+    """[N] :func:`place_sigmas` of the vertices."""
+    parts = [
+        np.stack(place_sigmas(views, mesh.vertices[part], voxel))
+        for part in batches(len(mesh.vertices))
+    ]
+    sigma, sigma_px = np.concatenate([np.empty((2, 0)), *parts], axis=1)
+    return sigma, sigma_px
 
 
 def _place_mesh(surface: FusedSurface, where: Placement, seen: str) -> PlacedMesh:

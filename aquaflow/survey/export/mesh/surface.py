@@ -8,6 +8,7 @@ hole stays a hole.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,15 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import load
-from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Chunk, truncation
+from aquaflow.render.library import Library
+from aquaflow.survey.export.mesh.blocks import (
+    BLOCK,
+    CHUNK_BLOCKS,
+    TRUNCATION_SIGMAS,
+    TRUNCATION_VOXELS,
+    Chunk,
+    truncation,
+)
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, SIGMA, ViewSurfaces
 
@@ -141,51 +150,69 @@ class ChunkDistances:
     too few views say anything of."""
 
 
-def fuse(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) -> ChunkDistances:
-    """Distances of ``chunk.voxels()``, each known to ``least_views`` views at least."""
+def fuse(
+    surfaces: ViewSurfaces,
+    chunk: Chunk,
+    voxel: float,
+    least_views: int,
+    library: Library | None = None,
+) -> ChunkDistances:
+    """Distances of ``chunk.voxels()``, each known to ``least_views`` views at least; with the
+    compiled kernels of ``library``, or by numpy."""
     voxels = chunk.voxels()
     low, high = voxels.min(axis=0) * voxel, voxels.max(axis=0) * voxel
     numbers = surfaces.around(low, high)
     places = voxels.astype(np.float64) * voxel
-    parts = (places[first : first + SLICE] for first in range(0, len(places), SLICE))
-    found = [_fused_slice(surfaces, numbers, part, voxel, least_views) for part in parts]
+    found = []
+    for first in range(0, len(places), SLICE):
+        sums = DistanceSums.of(places[first : first + SLICE])
+        for number in numbers:
+            if library is None:
+                add_by_numpy(sums, surfaces, number, voxel)
+            else:
+                add_compiled(library, sums, surfaces, number, voxel)
+        found.append(sums.distances(voxel, least_views))
     return ChunkDistances(np.concatenate(found))
 
 
-def _fused_slice(
-    surfaces: ViewSurfaces,
-    numbers: list[int],
-    places: Array,  # [M, 3] of voxels
-    voxel: float,
-    least_views: int,
-) -> Array:
-    """[M] as in Distances."""
-    total, weights = np.zeros(len(places)), np.zeros(len(places))
-    near = np.zeros(len(places), np.int32)
-    for number in numbers:
-        which, distance, reach, weight = _seen_by(surfaces, number, places, voxel)
-        total[which] += weight * np.minimum(distance, reach)
-        weights[which] += weight
-        near[which] += distance <= reach
-    known = near >= least_views
-    values = np.full(len(places), np.nan)
-    values[known] = total[known] / (weights[known] * voxel)
-    tiny = np.abs(values) < LEAST_SHIFT
-    values[tiny] = np.where(values[tiny] < 0.0, -LEAST_SHIFT, LEAST_SHIFT)
-    return values
+@dataclass(frozen=True)
+class DistanceSums:
+    """What some views say of places."""
+
+    places: Array
+    """[M, 3] in the frame of the mesh."""
+    total: Array
+    """[M] sum of the distances from the views' surfaces, each times its weight."""
+    weights: Array
+    """[M] sum of the weights."""
+    near: npt.NDArray[np.int32]
+    """[M] number of views whose surface is near."""
+
+    @staticmethod
+    def of(
+        places: Array,  # [M, 3]
+    ) -> DistanceSums:
+        """Of no view."""
+        count = len(places)
+        return DistanceSums(
+            np.ascontiguousarray(places), np.zeros(count), np.zeros(count), np.zeros(count, "i4")
+        )
+
+    def distances(self, voxel: float, least_views: int) -> Array:
+        """[M] weighted means in voxels; NaN where fewer than ``least_views`` surfaces are near."""
+        known = self.near >= least_views
+        values = np.full(len(self.places), np.nan)
+        values[known] = self.total[known] / (self.weights[known] * voxel)
+        tiny = np.abs(values) < LEAST_SHIFT
+        values[tiny] = np.where(values[tiny] < 0.0, -LEAST_SHIFT, LEAST_SHIFT)
+        return values
 
 
-def _seen_by(
-    surfaces: ViewSurfaces,
-    number: int,
-    places: Array,  # [M, 3]
-    voxel: float,
-) -> tuple[npt.NDArray[np.intp], Array, Array, Array]:
-    """Of the places [K] that a view says anything of: numbers, distances from its surface,
-    truncations, and weights."""
+def add_by_numpy(sums: DistanceSums, surfaces: ViewSurfaces, number: int, voxel: float) -> None:
+    """Add what one view says of the places, readable."""
     view, layers = surfaces.views[number], surfaces.surface(number)
     camera = view.camera
-    local = (places - view.T_uc.t) @ view.T_uc.R
+    local = (sums.places - view.T_uc.t) @ view.T_uc.R
     which = np.flatnonzero(local[:, 2] > voxel)
     local = local[which]
     u, v = camera.project(local).T - 0.5
@@ -195,13 +222,16 @@ def _seen_by(
     column, row = u.astype(np.intp), v.astype(np.intp)
     ranges = _between(layers[RANGE], row, column, v - row, u - column)
     nearest = (v + 0.5).astype(np.intp), (u + 0.5).astype(np.intp)
-    cosine, sigma = layers[COSINE][nearest], layers[SIGMA][nearest]
+    cosine, sigma = (layers[layer][nearest].astype(np.float64) for layer in (COSINE, SIGMA))
     distance = (ranges - np.linalg.norm(local, axis=1)) * cosine
     reach = truncation(sigma, voxel)
     with np.errstate(invalid="ignore"):
-        told = (distance >= -reach) & (ranges < surfaces.far) & np.isfinite(cosine)
-    weight = cosine[told] / sigma[told].astype(np.float64) ** 2
-    return which[told], distance[told], reach[told], weight
+        told = (distance >= -reach) & (ranges < surfaces.far)
+    which, distance, reach = which[told], distance[told], reach[told]
+    weight = cosine[told] / sigma[told] ** 2
+    sums.total[which] += weight * np.minimum(distance, reach)
+    sums.weights[which] += weight
+    sums.near[which] += distance <= reach
 
 
 def _between(
@@ -215,3 +245,39 @@ def _between(
     top = layer[row, column] * (1.0 - right) + layer[row, column + 1] * right
     bottom = layer[row + 1, column] * (1.0 - right) + layer[row + 1, column + 1] * right
     return np.asarray(top * (1.0 - down) + bottom * down)
+
+
+class _NativeFusion(ctypes.Structure):
+    """``FuseRanges`` of native/fuse_ranges.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("places", "ranges", "sigmas", "cosines")),
+        *((name, ctypes.c_void_p) for name in ("total", "weights", "near")),
+        ("count", ctypes.c_int64),
+        *((name, ctypes.c_int32) for name in ("width", "height")),
+        *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
+        ("R", ctypes.c_double * 9),
+        ("t", ctypes.c_double * 3),
+        *((name, ctypes.c_double) for name in ("nearest_z", "far")),
+        *((name, ctypes.c_double) for name in ("reach_sigmas", "least_reach", "most_reach")),
+    )
+
+
+def add_compiled(
+    library: Library, sums: DistanceSums, surfaces: ViewSurfaces, number: int, voxel: float
+) -> None:
+    """As :func:`add_by_numpy`, in an eighth of its time (native/fuse_ranges.h)."""
+    view, layers = surfaces.views[number], surfaces.surface(number)
+    camera, T_uc = view.camera, view.T_uc
+    given = _NativeFusion(count=len(sums.places), width=camera.width, height=camera.height)
+    of_view = {"ranges": layers[RANGE], "sigmas": layers[SIGMA], "cosines": layers[COSINE]}
+    own = {name: getattr(sums, name) for name in ("places", "total", "weights", "near")}
+    for name, array in {**own, **of_view}.items():
+        setattr(given, name, array.ctypes.data)
+    for name in ("fx", "fy", "cx", "cy"):
+        setattr(given, name, getattr(camera, name))
+    given.R[:], given.t[:] = T_uc.R.reshape(-1), T_uc.t
+    given.nearest_z, given.far = voxel, surfaces.far
+    given.reach_sigmas = TRUNCATION_SIGMAS
+    given.least_reach, given.most_reach = (each * voxel for each in TRUNCATION_VOXELS)
+    library.call("aq_fuse_ranges", ctypes.byref(given))

@@ -45,10 +45,10 @@ class TriangleMesh:
         # Where triangles fold back on each other none is right; up is as good as any.
         return np.where(length > 0.0, total / np.maximum(length, 1e-300), (0.0, 0.0, 1.0))
 
-    def without_small_pieces(self, least_area: float) -> TriangleMesh:
-        """The pieces, connected by vertices, that have this area at least."""
+    def without_small_pieces(self, least_area: float) -> tuple[TriangleMesh, Integers]:
+        """The pieces, connected by vertices, that have this area at least; and which vertices."""
         if not len(self.faces):
-            return self
+            return self, np.arange(len(self.vertices))
         a, b, c = self.faces.T
         ends = np.concatenate([a, b]), np.concatenate([b, c])
         count = len(self.vertices)
@@ -60,10 +60,7 @@ class TriangleMesh:
     def with_faces(
         self,
         kept: npt.NDArray[np.bool_],  # [M]
-    ) -> TriangleMesh:
-        """Some of the triangles, and the vertices that they use."""
-        faces = self.faces[kept]
-        used = np.zeros(len(self.vertices), bool)
-        used[faces] = True
-        number = np.cumsum(used) - 1
-        return TriangleMesh(self.vertices[used], number[faces])
+    ) -> tuple[TriangleMesh, Integers]:
+        """Some of the triangles with the vertices that they use, and the numbers of these here."""
+        used, faces = np.unique(self.faces[kept], return_inverse=True)
+        return TriangleMesh(self.vertices[used], faces.reshape(-1, 3)), used
