@@ -20,6 +20,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from aquaflow.base.errors.crash_report import FAILED
+
 TIMEOUT_S = 900.0
 """A command that hangs fails its test; the slowest here takes 20 s of CPU on an idle machine."""
 
@@ -56,9 +58,9 @@ def run_aquaflow(
         return Ran(code, _text(out), _text(err))
 
 
-def refused(ran: Ran, *named: object) -> None:
+def refused(ran: Ran, *named: object, code: int = FAILED) -> None:
     """The command failed with one sentence that names the input."""
-    assert ran.code == 1
+    assert ran.code == code
     assert ran.out == ""
     assert "Traceback" not in ran.err
     (line,) = ran.err.splitlines()

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import ConfigError, InputError, reason_of
+from aquaflow.base.errors import ArgumentError, InputError, reason_of
 
 Array = npt.NDArray[np.float64]
 BoardKind = Literal["charuco", "apriltag"]
@@ -65,7 +65,7 @@ class Detector:
         """Prepare for ``board``.
 
         Raises:
-            ConfigError: it has too few squares, or more markers than there are codes.
+            ArgumentError: it has too few squares, or more markers than there are codes.
         """
         self._made = made = opencv_board(board)
         settings = cv2.aruco.DetectorParameters()
@@ -116,10 +116,10 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard | cv2.aruco.GridBoard:
     """OpenCV's board, in metres.
 
     Raises:
-        ConfigError: it has too few squares, or more markers than there are codes.
+        ArgumentError: it has too few squares, or more markers than there are codes.
     """
     if min(board.columns, board.rows) < LEAST_SIDE:
-        raise ConfigError(
+        raise ArgumentError(
             f"a board of {board.columns} x {board.rows} squares is too small to calibrate with; "
             f"use {LEAST_SIDE} x {LEAST_SIDE} at least"
         )
@@ -128,7 +128,7 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard | cv2.aruco.GridBoard:
     size, codes = (board.columns, board.rows), len(dictionary.bytesList)
     markers = board.columns * board.rows // (2 if board.kind == "charuco" else 1)
     if markers > codes:
-        raise ConfigError(
+        raise ArgumentError(
             f"a {board.kind} board of {board.columns} x {board.rows} squares needs {markers} "
             f"markers, {name} has {codes}; use fewer squares"
         )
@@ -163,13 +163,13 @@ def write_board(board: Board, path: Path) -> None:
     """Write the board to print at its true size, as PDF or PNG.
 
     Raises:
-        ConfigError: the board cannot be, or the file's name ends in neither .pdf nor .png.
+        ArgumentError: the board cannot be, or the file's name ends in neither .pdf nor .png.
         InputError: the file cannot be written.
     """
     from PIL import Image
 
     if path.suffix.lower() not in {".pdf", ".png"}:
-        raise ConfigError(f"{path} is neither a .pdf nor a .png; choose one of them")
+        raise ArgumentError(f"{path} is neither a .pdf nor a .png; choose one of them")
     tens = max(1, round(board.square_m / INCH_M * DOTS_PER_INCH / 10.0))
     image = Image.fromarray(draw(board, 10 * tens))
     exact = 10 * tens * INCH_M / board.square_m

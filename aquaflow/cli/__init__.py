@@ -148,14 +148,15 @@ def map_command(
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
     from aquaflow.config.presets import load_configured
+    from aquaflow.config.stage import COMMAND_LINE
 
     settings = load_configured(
         config,
         preset,
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
-        "command line",
+        COMMAND_LINE,
     )
-    from aquaflow.base.errors import InputError
+    from aquaflow.base.errors import ArgumentError
     from aquaflow.base.errors.failures import Failures
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
@@ -164,12 +165,12 @@ def map_command(
 
     calibration = None if calib is None else load_camera(calib)
     if realtime and telemetry:
-        raise InputError(
+        raise ArgumentError(
             "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
             "log in a replay.yaml"
         )
     if realtime and topic is not None:
-        raise InputError("--topic is for a replay; leave out --realtime")
+        raise ArgumentError("--topic is for a replay; leave out --realtime")
     if in_site is not None:
         checked_site(in_site, out)
     if realtime:

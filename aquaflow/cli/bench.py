@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.cli.console import (
     PRESETS,
     GroupWithDefault,
@@ -60,7 +60,7 @@ def bench(
     from aquaflow.lab.bench.table import around_section
 
     if data is not None and suite is None and not scene:
-        raise InputError(
+        raise ArgumentError(
             f"bench knows neither a command nor a suite '{data}'; "
             "give render, --suite real DATA_DIR, or --scene PATH"
         )

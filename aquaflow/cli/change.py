@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
@@ -46,9 +46,11 @@ def change(
     """Compare two dives of one place: what was gained, lost, moved, bleached."""
     _refuse_sizes({"--cylinder": cylinder, "--reach": reach})
     if not 0.0 < false <= MOST_RATE:
-        raise InputError(f"--false {false:g} is no share; give one above 0, {MOST_RATE:g} at most")
+        raise ArgumentError(
+            f"--false {false:g} is no share; give one above 0, {MOST_RATE:g} at most"
+        )
     if site is not None and transform is not None:
-        raise InputError("a site knows how its dives lie; leave out --transform, or the site")
+        raise ArgumentError("a site knows how its dives lie; leave out --transform, or the site")
     if site is None:
         from aquaflow.base.storage.dive_status import refuse_without_map
 
@@ -84,7 +86,7 @@ def change(
 def _refuse_sizes(given: dict[str, float | None]) -> None:
     for name, value in given.items():
         if value is not None and not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} {value:g} is no length; give a positive one")
+            raise ArgumentError(f"{name} {value:g} is no length; give a positive one")
 
 
 def _in_words(found: Changes) -> list[str]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from aquaflow.base.errors import InputError, printable_text
+from aquaflow.base.errors import ArgumentError, printable_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -75,10 +75,10 @@ def one_of(choices: Sequence[str], value: str, option: str) -> str:
     """The value of an option that has to be one of ``choices``.
 
     Raises:
-        InputError: it is another.
+        ArgumentError: it is another.
     """
     if value not in choices:
-        raise InputError(f"{option} is {value!r}; use one of {', '.join(choices)}")
+        raise ArgumentError(f"{option} is {value!r}; use one of {', '.join(choices)}")
     return value
 
 
@@ -96,12 +96,13 @@ def checked_site(folder: Path, out: Path | None) -> Path:
     """The folder of ``--in``, refused before anything heavy begins.
 
     Raises:
-        InputError: it is no dive in which places can be found again, or the one in ``--out``.
+        InputError: it is no dive in which places can be found again.
+        ArgumentError: it is the one in ``--out``.
     """
     from aquaflow.tracking.base import base_of
 
     if out is not None and out.resolve() == folder.resolve():
-        raise InputError(f"--in and --out are both {folder}; a dive is never changed by another")
+        raise ArgumentError(f"--in and --out are both {folder}; a dive is never changed by another")
     base_of(folder)
     return folder
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.base.errors.regular_file import refuse_linked_folders
 from aquaflow.cli.console import GroupWithDefault, Json, WhiteBalanceOption, progress_bars
 
@@ -154,7 +154,9 @@ def export(
     }  # fmt: skip
     _refuse_others(formats, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
-        raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
+        raise ArgumentError(
+            f"--resolution {resolution:g} is no size of a pixel; give a positive one"
+        )
     from aquaflow.dive.dive import MAP, Dive
 
     read = Dive(dive)
@@ -193,7 +195,8 @@ def _targets(
     one is named, or fills a folder.
 
     Raises:
-        InputError: ``out`` is a file of another format, or no folder can be there.
+        ArgumentError: ``out`` is a file of another format.
+        InputError: no folder can be there.
     """
     if out is None:
         return {each: _own_target(dive / NAMES[each]) for each in formats}
@@ -206,7 +209,7 @@ def _targets(
             if len(formats) == 1 and first in ENDINGS
             else ""
         )
-        raise InputError(f"--out {out} is no name for {', '.join(formats)}; give {own}a folder")
+        raise ArgumentError(f"--out {out} is no name for {', '.join(formats)}; give {own}a folder")
     if len(formats) == 1 and first in FOLDERS:
         return {first: _make_parents(out)}
     return {each: _make_parents(out / NAMES[each]) for each in formats}
@@ -278,7 +281,7 @@ def report(
 ) -> None:
     """Write the report of a finished dive as one PDF, to print or to send."""
     if pdf is not None and pdf.suffix.lower() != ".pdf":
-        raise InputError(f"{pdf} does not end in .pdf; give the report a file of its own")
+        raise ArgumentError(f"{pdf} does not end in .pdf; give the report a file of its own")
     from aquaflow.dive.dive import FRAMES, METRICS, Dive
     from aquaflow.survey.report.pdf import write_pdf
     from aquaflow.survey.report.report_of import report_of
@@ -318,7 +321,7 @@ def _own_target(path: Path) -> Path:
 
 def _choose_white(dive: Dive, white_balance: str, shows_water: bool) -> None:
     if shows_water:
-        raise InputError(
+        raise ArgumentError(
             "a white balance is of colours without water, and these are as the camera saw them; "
             "leave --white-balance out"
         )
@@ -331,7 +334,7 @@ def _refuse_others(formats: Sequence[ExportFormat], given: dict[str, bool]) -> N
     known = set().union(*(OPTIONS[each] for each in formats))
     unknown = [name for name, is_given in given.items() if is_given and name not in known]
     if unknown:
-        raise InputError(f"--format {','.join(formats)} knows no {unknown[0]}; leave it out")
+        raise ArgumentError(f"--format {','.join(formats)} knows no {unknown[0]}; leave it out")
 
 
 def _restore(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
@@ -546,8 +549,10 @@ def _refuse(
         name for name, is_given in given.items() if is_given and name not in VIDEO_OPTIONS[kind]
     ]
     if unknown:
-        raise InputError(f"--kind {kind.value} knows no {unknown[0]}; leave it out")
+        raise ArgumentError(f"--kind {kind.value} knows no {unknown[0]}; leave it out")
     if seconds is not None and not (math.isfinite(seconds) and 0.0 < seconds <= LONGEST_FLIGHT_S):
-        raise InputError(f"--seconds {seconds:g} is no length; give 0 to {LONGEST_FLIGHT_S:.0f}")
+        raise ArgumentError(f"--seconds {seconds:g} is no length; give 0 to {LONGEST_FLIGHT_S:.0f}")
     if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
-        raise InputError(f"--width {width} is out of range; give {WIDTHS[0]} to {WIDTHS[1]} pixels")
+        raise ArgumentError(
+            f"--width {width} is out of range; give {WIDTHS[0]} to {WIDTHS[1]} pixels"
+        )

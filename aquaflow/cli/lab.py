@@ -60,7 +60,7 @@ def synth(
     """Write a synthetic dive with its ground truth."""
     from pydantic import ValidationError
 
-    from aquaflow.base.errors import ConfigError, words_of
+    from aquaflow.base.errors import ArgumentError, words_of
     from aquaflow.lab.synthetic.config import SyntheticConfig
     from aquaflow.lab.synthetic.dive import write_dive
 
@@ -74,7 +74,7 @@ def synth(
         config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})
     except ValidationError as error:
         first = error.errors()[0]
-        raise ConfigError(f"--{first['loc'][0]}: {words_of(first['msg'])}") from error
+        raise ArgumentError(f"--{first['loc'][0]}: {words_of(first['msg'])}") from error
     with progress_bars(quiet=as_json) as progress:
         write_dive(out, config, lambda done, total: progress("render", done, total))
     if as_json:
@@ -100,12 +100,15 @@ def evaluate(
     """Measure a dive: colours of restored views, and what the truth allows to compare."""
     from aquaflow.base.errors import InputError
     from aquaflow.base.storage.dive_status import refuse_unfinished
+    from aquaflow.config import SourceConfig
+    from aquaflow.config.stage import COMMAND_LINE, validate
     from aquaflow.lab.evaluation.epipolar_error import evaluate_epipolar
     from aquaflow.lab.evaluation.naturalness import evaluate_naturalness
     from aquaflow.lab.evaluation.protocol import evaluate_dive
     from aquaflow.lab.evaluation.restoration import evaluate_restoration
     from aquaflow.lab.evaluation.summary import in_words
 
+    validate(SourceConfig, {"crop": clean_crop}, COMMAND_LINE)
     refuse_unfinished(dive)
     natural = evaluate_naturalness(dive)
     if truth is None and clean is None and recording is None and natural is None:
@@ -207,7 +210,7 @@ def batch(
 ) -> None:
     """Map many recordings, each into a dive of its own; go on where an earlier batch ended."""
     from aquaflow.config.presets import load_configured
-    from aquaflow.config.stage import validate
+    from aquaflow.config.stage import COMMAND_LINE, validate
     from aquaflow.lab.batch.job import BatchConfig
 
     settings = load_configured(
@@ -218,7 +221,7 @@ def batch(
             "source": {"every": every, "width": width},
             "mapping": {"enabled": False if tracking_only else None},
         },
-        "command line",
+        COMMAND_LINE,
     )
     asked = validate(
         BatchConfig,
@@ -226,7 +229,7 @@ def batch(
             "jobs": jobs, "memory_gb": memory, "retries": retries, "cluster": cluster,
             "cache": cache,
         },
-        "command line",
+        COMMAND_LINE,
     )  # fmt: skip
     from aquaflow.lab.batch.batch import run_batch
     from aquaflow.lab.batch.site import Sites

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.cli.console import GroupWithDefault, Json, progress_bars
 
 if TYPE_CHECKING:
@@ -82,15 +82,15 @@ def measure(
     """Measure in a finished dive: the ground in numbers, or between points; or tend its notes."""
     if notes or delete:
         if point or any(each is not None for each in (shape, cell, note, csv)):
-            raise InputError("--notes and --delete measure nothing; give no other options")
+            raise ArgumentError("--notes and --delete measure nothing; give no other options")
         _tend_notes(_with_map(dive), delete or [], as_json)
         return
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
-        raise InputError(f"--cell {cell:g} is no size of a cell; give a positive one")
+        raise ArgumentError(f"--cell {cell:g} is no size of a cell; give a positive one")
     if csv is not None and csv.suffix.lower() != ".csv":
-        raise InputError(f"{csv} does not end in .csv; give the table a file of its own")
+        raise ArgumentError(f"{csv} does not end in .csv; give the table a file of its own")
     if not point and (shape is not None or note is not None):
-        raise InputError("--as and --note need points; give --point for each")
+        raise ArgumentError("--as and --note need points; give --point for each")
     read = _with_map(dive)
     from aquaflow.survey.measure.finished_dive import numbers_of_dive
     from aquaflow.survey.measure.reef_numbers import write_csv

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.base.errors import AquaFlowError, ArgumentError, InputError
 from aquaflow.base.worker import usable_threads
 from aquaflow.cli.console import Json, one_of, progress_bars, table_console
 
@@ -320,7 +320,7 @@ def _three(text: str, option: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) != 3:
-        raise InputError(f"{option} is {text!r}; give three numbers, as 0.5,0.5,0.5")
+        raise ArgumentError(f"{option} is {text!r}; give three numbers, as 0.5,0.5,0.5")
     return numbers
 
 
@@ -372,7 +372,7 @@ def verify(
         how: Any = one_of(PRECISIONS, precision, "--precision")
         settings = RuntimeSettings(where, how)
     if folder is None and device is not None:
-        raise InputError(f"nothing to run on {device}; give the folder of a prior")
+        raise ArgumentError(f"nothing to run on {device}; give the folder of a prior")
     if folder is None:
         with TemporaryDirectory() as scratch, progress_bars(as_json) as advance:
             name, parity = "mast3r (tiny)", verify_tiny(Path(scratch) / "prior", advance)

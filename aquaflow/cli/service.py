@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from aquaflow.live.recorder.session import RecordingSession
     from aquaflow.live.recorder.status import RecorderStatus
 
+NOTHING_TO_MAP = "nothing to map: give --config with cameras, or --source"
+NOTHING_TO_RECORD = "nothing to record: give --config with cameras or telemetry, or --source"
+
 POOR_RESULT = 3
 """Exit code of a dive that was written but has warnings: hardly any poses, an empty map, a
 calibration that does not fit, or a defect of ours."""
@@ -79,18 +82,20 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""
-    from aquaflow.base.errors import InputError
+    from aquaflow.base.errors import ArgumentError, InputError
     from aquaflow.config.vehicle import load_vehicle, looking_in
     from aquaflow.geometry.camera import load_camera
     from aquaflow.live.onboard import devices, recording
 
+    if source is None and config is None:
+        raise ArgumentError(NOTHING_TO_MAP)
     vehicle = load_vehicle(config, preset)
     if in_site is not None:
         vehicle = looking_in(vehicle, checked_site(in_site, out))
     if source is None and not vehicle.cameras:
-        raise InputError("nothing to map: give --config with cameras, or --source")
+        raise InputError(NOTHING_TO_MAP)
     if source is None and calib is not None:
-        raise InputError(
+        raise ArgumentError(
             f"--calib {calib} is for --source; a camera's calibration stands in --config, under "
             "cameras"
         )
@@ -165,13 +170,13 @@ def view(
     """Show a finished dive or a site in a browser, to look around and to measure; until Ctrl-C."""
     from aquaflow.base.errors import InputError
     from aquaflow.config.service import ViewerConfig
-    from aquaflow.config.stage import validate
+    from aquaflow.config.stage import COMMAND_LINE, validate
     from aquaflow.survey.site.manifest import is_site
     from aquaflow.survey.viewer.finished import note_unfinished, open_dive
     from aquaflow.survey.viewer.site_page import open_site
 
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
-    config = validate(ViewerConfig, asked | {"splats": splats}, "command line")
+    config = validate(ViewerConfig, asked | {"splats": splats}, COMMAND_LINE)
     if is_site(dive):
         if white_balance is not None:
             raise InputError(
@@ -312,16 +317,18 @@ def record(
     as_json: Json = False,
 ) -> None:
     """Record cameras and telemetry to MCAP files; Ctrl-C ends it cleanly."""
-    from aquaflow.base.errors import InputError
+    from aquaflow.base.errors import ArgumentError, InputError
     from aquaflow.config.vehicle import VehicleConfig, load_vehicle
     from aquaflow.live.recorder.recorder import Recorder
     from aquaflow.live.recorder.session import RecordingSession
 
+    if source is None and config is None:
+        raise ArgumentError(NOTHING_TO_RECORD)
     vehicle = VehicleConfig() if config is None else load_vehicle(config)
     if picture is not None:
         vehicle = _with_picture(vehicle, picture)
     if source is None and not (vehicle.cameras or vehicle.telemetry.devices):
-        raise InputError("nothing to record: give --config with cameras or telemetry, or --source")
+        raise InputError(NOTHING_TO_RECORD)
     folder = out or Path("out") / time.strftime("recording-%Y%m%d-%H%M%S")
     add_sources = _devices(vehicle) if source is None else _recording(source)
     session = RecordingSession(Recorder(folder, vehicle.recording))
@@ -338,10 +345,10 @@ def record(
 
 def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
     from aquaflow.config.service import RecordingConfig
-    from aquaflow.config.stage import validate
+    from aquaflow.config.stage import COMMAND_LINE, validate
 
     asked = vehicle.recording.model_dump() | {"picture": picture}
-    recording = validate(RecordingConfig, asked, "--picture")
+    recording = validate(RecordingConfig, asked, COMMAND_LINE)
     return vehicle.model_copy(update={"recording": recording})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from aquaflow.config.stage import MountingConfig, StageConfig
 
@@ -150,6 +150,22 @@ CameraConfig: TypeAlias = Annotated[
 # Settings of a source: which frames, and how they are prepared.
 
 
+def checked_crop(crop: str) -> str:
+    """``crop``, if there are pictures that it fits.
+
+    Raises:
+        ValueError: it is neither ``left``, ``right`` nor ``x,y,width,height`` in pixels.
+    """
+    if crop not in {"left", "right"}:
+        try:
+            x, y, width, height = (int(part) for part in crop.split(","))
+        except ValueError:
+            x = y = width = height = -1
+        if min(x, y) < 0 or min(width, height) < 1:
+            raise ValueError(f"{crop[:80]!r} is neither left, right nor x,y,width,height in pixels")
+    return crop
+
+
 class SourceConfig(StageConfig):
     """Which frames, and how they are prepared."""
 
@@ -162,7 +178,9 @@ class SourceConfig(StageConfig):
         le=8192,
         description="px; frames are made this wide (None: 480, or less if smaller)",
     )
-    crop: str | None = Field(None, description="left | right | x,y,width,height, before resizing")
+    crop: Annotated[str, AfterValidator(checked_crop)] | None = Field(
+        None, description="left | right | x,y,width,height, before resizing"
+    )
     mask: Path | None = Field(
         None,
         description="picture of the camera's or the crop's size: white is used, black is not "

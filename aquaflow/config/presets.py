@@ -6,7 +6,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from aquaflow.base.errors import ConfigError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.config import Config, load_config, parse_config
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -93,10 +93,10 @@ def preset(name: str) -> dict[str, Any]:
     """The overrides of the config that ``name`` stands for.
 
     Raises:
-        ConfigError: there is no such preset.
+        ArgumentError: there is no such preset.
     """
     if name not in PRESETS:
-        raise ConfigError(f"there is no preset '{name}'; choose {', '.join(PRESETS)}")
+        raise ArgumentError(f"there is no preset '{name}'; choose {', '.join(PRESETS)}")
     return deepcopy(PRESETS[name])
 
 

@@ -9,9 +9,11 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from aquaflow.base.errors import ConfigError, path_of_key, words_of
+from aquaflow.base.errors import ArgumentError, ConfigError, path_of_key, words_of
 
 Value = TypeVar("Value")
+COMMAND_LINE = "command line"
+"""Origin of the values that options set."""
 IS_LAB = "a switch of the lab"
 """What ``Lab`` leaves in the metadata of a field."""
 Lab: TypeAlias = Annotated[Value, IS_LAB]
@@ -31,7 +33,8 @@ def validate(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnySta
     """Validate a mapping read from ``origin``.
 
     Raises:
-        ConfigError: with the path of the first key that is unknown or out of range.
+        ConfigError: with the path of the first key that is unknown or out of range; from
+            ``COMMAND_LINE`` an ArgumentError.
     """
     try:
         return model.model_validate(data)
@@ -40,7 +43,8 @@ def validate(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnySta
         path = path_of_key(first["loc"])
         unknown = first["type"] == "extra_forbidden"
         problem = "is not a known key" if unknown else words_of(first["msg"])
-        raise ConfigError(f"{origin}: '{path}' {problem}; see `aquaflow config`") from error
+        kind = ArgumentError if origin == COMMAND_LINE else ConfigError
+        raise kind(f"{origin}: '{path}' {problem}; see `aquaflow config`") from error
 
 
 def stages_of(

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.config.white_balance import CAMERA, DAYLIGHT, NEUTRAL, white_balance_named
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import refuse_outside, refuse_without_water, view_of_frame
@@ -38,8 +38,9 @@ def show_in(dive: Dive, choice: str) -> None:
     files stay as they are. Daylight that the scene itself contradicts is warned of.
 
     Raises:
-        InputError: it is no white balance, there is no such pixel, the map shows nothing there, or
-            has no water, or no depth is known of the dive.
+        ArgumentError: it is no white balance.
+        InputError: there is no such pixel, the map shows nothing there, or has no water, or no
+            depth is known of the dive.
         ConfigError: the dive's settings cannot be read.
     """
     name = _name(choice)
@@ -71,7 +72,7 @@ def _name(choice: str) -> str | None:
     try:
         return white_balance_named(choice)
     except ValueError as error:
-        raise InputError(str(error)) from error
+        raise ArgumentError(str(error)) from error
 
 
 def depths_below(rows: Sequence[PoseRow], sub_map: int) -> Depths | None:
@@ -114,7 +115,7 @@ def _place(text: str) -> tuple[int, float, float]:
             return int(frame), x, y
     except ValueError:
         pass
-    raise InputError(
+    raise ArgumentError(
         f"{text[:80]!r} is no white balance; give {CAMERA}, {NEUTRAL}, {DAYLIGHT}, "
         f"{DAYLIGHT}:TYPE (such as {DAYLIGHT}:oceanic_II), or FRAME:X,Y of something grey"
     )

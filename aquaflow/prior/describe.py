@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from aquaflow.base.errors import AquaFlowError, InputError, first_line, words_of
+from aquaflow.base.errors import AquaFlowError, ArgumentError, InputError, first_line, words_of
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.depth_describer import DepthDescriber
 from aquaflow.prior.describers import describer_in
@@ -71,14 +71,14 @@ def depth_card(
     """What the user says of the network.
 
     Raises:
-        InputError: something that is not possible.
+        ArgumentError: something that is not possible.
     """
     try:
         return DepthCard.model_validate(stated)
     except ValidationError as error:
         first = error.errors()[0]
         option = "".join(f"--{part}: " for part in first["loc"][:1]).replace("_", "-")
-        raise InputError(
+        raise ArgumentError(
             f"{option}{words_of(first['msg'])}; see `aquaflow lab prior describe --help`"
         ) from error
 

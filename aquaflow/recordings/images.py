@@ -297,8 +297,6 @@ def _times_ns(stamps: Path | None, files: list[Path], fps: float | None) -> tupl
         times = [round((second - seconds[0]) * NS_PER_S) for second in seconds]
         return times, f"the times of the pictures are those of {stamps}"
     if fps is not None:
-        if not (np.isfinite(fps) and fps > 0.0):
-            raise InputError(f"a frame rate of {fps:g} pictures a second is not above zero")
         return _evenly(len(files), fps), f"the pictures have the {fps:g} a second that were given"
     if (named := _increasing(time_of_name(file.stem) for file in files)) is not None:
         kind, times = named

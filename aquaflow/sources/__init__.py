@@ -6,12 +6,13 @@ so that a site can add its own without touching this package.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.config.cameras import CameraConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.config.telemetry import TelemetryConfig
@@ -201,8 +202,11 @@ def open_recording(
     recording with several picture topics, ``topic``.
 
     Raises:
+        ArgumentError: ``fps`` is no rate.
         InputError: nothing is there, or no installed source reads it.
     """
+    if fps is not None and not (math.isfinite(fps) and fps > 0.0):
+        raise ArgumentError(f"a frame rate of {fps:g} pictures a second is not above zero")
     if not path.exists():
         raise InputError(f"there is nothing at {path}; give a folder of images or a video file")
     reader = camera_reader(path)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.sources import (
     FollowsPictures,
     RecordedTelemetry,
@@ -52,11 +52,13 @@ def open_telemetry(
     that is not known. ``fps`` and ``topic`` are those by which the recording was opened.
 
     Raises:
-        InputError: a log is missing, no installed source finds telemetry in it, or an offset was
-            given without a log.
+        InputError: a log is missing, or no installed source finds telemetry in it.
+        ArgumentError: an offset was given without a log.
     """
     if offset_s is not None and not logs:
-        raise InputError("--telemetry-offset says when a log begins; give the log by --telemetry")
+        raise ArgumentError(
+            "--telemetry-offset says when a log begins; give the log by --telemetry"
+        )
     reader = None if recording is None else telemetry_reader(recording)
     own = [] if reader is None or recording is None else [reader.open(recording)]
     for each in own:

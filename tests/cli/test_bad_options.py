@@ -8,20 +8,24 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.base.errors.crash_report import FAILED, MISUSED
 from tests.command_line import Cli, refused
-
-USAGE = 2
-"""Exit code of an option that does not exist."""
 
 # --- options and files beside the recording -------------------------------------------------------
 
 
-@pytest.mark.parametrize("crop", ["100,0,100,120", "0,0,0,0", "middle", "1,2,3", "-1,0,20,20"])
-def test_a_crop_that_does_not_fit_is_refused(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path, crop: str
+@pytest.mark.parametrize(
+    ("crop", "code"),
+    [
+        *((crop, MISUSED) for crop in ("0,0,0,0", "middle", "1,2,3", "-1,0,20,20")),
+        ("100,0,100,120", FAILED),
+    ],
+)
+def test_a_crop_that_fits_no_picture_or_not_this_one_is_refused(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path, crop: str, code: int
 ) -> None:
     ran = aquaflow("map", small_recording, f"--crop={crop}", "--out", tmp_path / "out")
-    refused(ran, crop)
+    refused(ran, crop, code=code)
 
 
 def test_a_mask_that_is_no_picture_or_of_another_size_is_refused(
@@ -59,7 +63,7 @@ def test_a_calibration_for_no_recording_is_refused(aquaflow: Cli, tmp_path: Path
     vehicle = tmp_path / "vehicle.yaml"
     vehicle.write_text("cameras: {front: {kind: v4l2}}")
     ran = aquaflow("run", "--config", vehicle, "--calib", "camera.yaml")
-    refused(ran, "camera.yaml", "--source")
+    refused(ran, "camera.yaml", "--source", code=MISUSED)
 
 
 @pytest.mark.parametrize("option", ["--speed=0", "--seconds=-3"])
@@ -67,7 +71,7 @@ def test_a_time_that_cannot_pass_is_refused(
     aquaflow: Cli, small_recording: Path, tmp_path: Path, option: str
 ) -> None:
     ran = aquaflow("run", "--source", small_recording, option, "--out", tmp_path / "out")
-    assert ran.code == USAGE
+    assert ran.code == MISUSED
     assert not (tmp_path / "out").exists()
 
 
@@ -103,13 +107,13 @@ def test_an_option_out_of_range_is_refused_by_its_name(
     aquaflow: Cli, small_recording: Path, tmp_path: Path, option: str, value: int
 ) -> None:
     ran = aquaflow("map", small_recording, f"--{option}", value, "--out", tmp_path / "out")
-    refused(ran, option)
+    refused(ran, option, code=MISUSED)
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_option_is_a_usage_error(aquaflow: Cli, tmp_path: Path) -> None:
     ran = aquaflow("map", tmp_path, "--evry", 2)
-    assert ran.code == USAGE
+    assert ran.code == MISUSED
     assert "--evry" in ran.err
     assert "Traceback" not in ran.err
 
@@ -120,14 +124,68 @@ def test_an_unknown_option_is_a_usage_error(aquaflow: Cli, tmp_path: Path) -> No
 def test_a_synthetic_dive_that_does_not_exist_is_refused(
     aquaflow: Cli, tmp_path: Path, option: str, value: object
 ) -> None:
-    refused(aquaflow("lab", "synth", tmp_path / "s", f"--{option}", value), f"--{option}")
+    refused(
+        aquaflow("lab", "synth", tmp_path / "s", f"--{option}", value), f"--{option}", code=MISUSED
+    )
 
 
 def test_values_that_are_offered_can_be_given_as_they_are_offered(
     aquaflow: Cli, tmp_path: Path
 ) -> None:
     said = aquaflow("lab", "synth", tmp_path / "s", "--water", "milk")
-    refused(said, "'coastal_1C'", "'oceanic_IB'")
+    refused(said, "'coastal_1C'", "'oceanic_IB'", code=MISUSED)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("map", "R", "--preset", "moon"),
+        ("map", "R", "--realtime", "--topic", "/a"),
+        ("map", "R", "--telemetry-offset", "2"),
+        ("map", "R", "--in", "D", "--out", "D"),
+        ("run",),
+        ("run", "--source", "R", "--preset", "moon"),
+        ("run", "status", "--url", "ftp://here"),
+        ("record",),
+        ("record", "--source", "R", "--picture", "gif"),
+        ("inspect", "R", "--fps", "0"),
+        ("view", "D", "--port", "99999"),
+        ("view", "D", "--white-balance", "purple"),
+        ("export", "D", "--format", "laz", "--resolution", "1"),
+        ("export", "D", "--format", "dem", "--resolution", "-1"),
+        ("export", "D", "--format", "spz", "--out", "map.tif"),
+        ("export", "D", "--format", "spz", "--white-balance", "daylight:tap"),
+        ("export", "report", "D", "--pdf", "report.doc"),
+        ("export", "video", "D", "--out", "x.mp4", "--seconds", "5"),
+        ("measure", "D", "--point", "here"),
+        ("measure", "D", "--cell", "0"),
+        ("measure", "D", "--csv", "numbers.xls"),
+        ("measure", "level", "D", "--point", "up"),
+        ("change", "--from", "D", "--to", "D", "--false", "2"),
+        ("calibrate", "--print-board", "board.doc"),
+        ("calibrate", "--print-board", "board.pdf", "--columns", "1"),
+        ("lab", "evaluate", "D", "--clean", "R", "--clean-crop", "middle"),
+        ("lab", "stress", "--family", "moon"),
+        ("lab", "ablate", "--suite", "ci", "--part", "moon"),
+        ("lab", "bench", "--suite", "moon"),
+        ("lab", "bench", "--suite", "ci", "--device", "abacus"),
+        ("lab", "bench", "growth", "--frames", "1"),
+        ("lab", "batch", "R", "--out", "SITE", "--retries", "-1"),
+        ("lab", "prior", "train", "mast3r", "--checkpoint", "w", "--out", "o", "--data", "moon"),
+    ],
+    ids=" ".join,
+)
+def test_wrong_arguments_are_told_from_bad_files_by_their_exit_code(
+    aquaflow: Cli,
+    small_recording: Path,
+    small_dive: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = {"R": small_recording, "D": small_dive}
+    refused(aquaflow(*(paths.get(word, word) for word in words)), code=MISUSED)
 
 
 # --- folders to write to and to read from ---------------------------------------------------------

@@ -34,7 +34,9 @@ def test_a_camera_that_is_not_there_is_told_on_stderr_and_in_the_log(
     words = ("run", "--config", tmp_path / "vehicle.yaml", "--out", dive)
     ran = aquaflow(*words, meanwhile=stop_when_told)
     told = f"camera 'front' is waited for: no video from {ABSENT}"
-    assert ran.err.splitlines() == [told]
+    first, last = ran.err.splitlines()
+    assert first == told
+    assert last == f"dive: no frame could be read, see {dive / 'frames.csv'}"
     lines = [json.loads(line) for line in (dive / "log.jsonl").read_text().splitlines()]
     about = [line for line in lines if line.get("source") == "front"]
     assert [(line["event"], line["message"], line["t_s"]) for line in about] == [

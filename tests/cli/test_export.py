@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors.crash_report import MISUSED
 from tests.command_line import Cli, refused
 
 COARSE = ("--resolution", 0.3)
@@ -52,7 +53,7 @@ def test_a_file_of_another_format_is_refused(
     aquaflow: Cli, small_dive: Path, tmp_path: Path, formats: str, out: str
 ) -> None:
     ran = aquaflow("export", small_dive, "--format", formats, "--out", tmp_path / out)
-    refused(ran, tmp_path / out, "folder")
+    refused(ran, tmp_path / out, "folder", code=MISUSED)
     assert not list(tmp_path.iterdir())
 
 

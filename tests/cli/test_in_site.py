@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors.crash_report import MISUSED
 from tests.command_line import Cli, refused
 from tests.small_recording import HASTY
 
@@ -53,7 +54,7 @@ def test_a_dive_is_never_written_over_the_one_that_it_is_looked_for_in(
     aquaflow: Cli, small_recording: Path, small_dive: Path
 ) -> None:
     ran = aquaflow("map", small_recording, "--out", small_dive, "--in", small_dive, "--overwrite")
-    refused(ran, "are both")
+    refused(ran, "are both", code=MISUSED)
 
 
 def test_a_recognised_dive_says_in_whose_frame_it_is(

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.base.errors.failures import Failures
 from aquaflow.dive.replay import synchronise, turns_of
 from aquaflow.dive.run import DiveRun
@@ -147,7 +148,7 @@ def test_a_log_without_an_offset_is_kept_apart_by_name(small_recording: Path) ->
 
 
 def test_an_offset_without_a_log_is_refused(small_recording: Path) -> None:
-    with pytest.raises(InputError, match=r"--telemetry-offset .* give the log by --telemetry"):
+    with pytest.raises(ArgumentError, match=r"--telemetry-offset .* give the log by --telemetry"):
         open_telemetry(small_recording, (), 3.0)
 
 
@@ -175,7 +176,9 @@ def test_a_missing_log_and_one_without_telemetry_are_refused(
     picture = tmp_path / "a.png"
     picture.write_bytes(b"no telemetry")
     refused(command("map", small_recording, "--telemetry", picture, *out), picture)
-    refused(command("map", small_recording, "--telemetry-offset", 3, *out), "--telemetry")
+    refused(
+        command("map", small_recording, "--telemetry-offset", 3, *out), "--telemetry", code=MISUSED
+    )
     assert not (tmp_path / "dive").exists()
 
 
@@ -184,4 +187,8 @@ def test_a_log_beside_a_live_run_is_refused(
 ) -> None:
     log = small_recording / "telemetry.csv"
     out = ("--out", tmp_path / "dive")
-    refused(command("map", small_recording, "--realtime", "--telemetry", log, *out), "replay.yaml")
+    refused(
+        command("map", small_recording, "--realtime", "--telemetry", log, *out),
+        "replay.yaml",
+        code=MISUSED,
+    )

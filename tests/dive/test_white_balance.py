@@ -12,7 +12,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.cli import app
 from aquaflow.config import Config
@@ -199,7 +199,7 @@ def test_a_browser_shows_the_white_balance_that_was_chosen_and_knows_that_of_the
 def test_what_is_no_white_balance_is_refused_in_a_sentence(
     dive: Path, asked: str, said: str
 ) -> None:
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(AquaFlowError, match=said):
         show_in(Dive(dive), asked)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from aquaflow.base.errors.crash_report import FAILED, MISUSED
 from aquaflow.lab.bench.picture import draw
 from aquaflow.lab.bench.table import BEGIN, END
 from tests.command_line import Cli, refused
@@ -106,10 +107,10 @@ def test_training_on_a_device_that_is_not_there_is_refused(
     command: Cli, tmp_path: Path, device: str
 ) -> None:
     ran = command("lab", "prior", "train", "compact", "--device", device, "--out", tmp_path / "out")
-    refused(ran, f"'{device}'")
+    refused(ran, f"'{device}'", code=FAILED if device == "cuda:99" else MISUSED)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("device", ["banana", "cuda:99"])
 def test_timing_on_a_device_that_is_not_there_is_refused(command: Cli, device: str) -> None:
-    refused(command("lab", "prior", "bench", "--device", device), "device")
+    refused(command("lab", "prior", "bench", "--device", device), "device", code=MISUSED)

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.base.errors.crash_report import MISUSED
 from tests.command_line import Cli, refused
 from tests.small_recording import HASTY
-
-USAGE = 2
 
 
 @pytest.mark.parametrize(
@@ -32,7 +31,7 @@ def test_a_time_that_no_clock_waits_for_is_a_usage_error(
     command: Cli, pictures: Path, tmp_path: Path, arguments: tuple[str, ...]
 ) -> None:
     ran = command(*arguments, "--source", pictures, "--out", tmp_path / "out")
-    assert ran.code == USAGE
+    assert ran.code == MISUSED
     assert "--" in ran.err
     assert "Traceback" not in ran.err
     assert not (tmp_path / "out").exists()
@@ -42,7 +41,7 @@ def test_a_width_beyond_all_cameras_is_refused(
     command: Cli, pictures: Path, tmp_path: Path
 ) -> None:
     ran = command("map", pictures, "--width", "999999999999", "--out", tmp_path / "out")
-    refused(ran, "width", "8192")
+    refused(ran, "width", "8192", code=MISUSED)
     assert not (tmp_path / "out").exists()
 
 

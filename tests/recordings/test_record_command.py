@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.config.service import RecordingConfig
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.geometry.camera import guess_camera
@@ -79,7 +80,7 @@ def test_systemds_sigterm_ends_it_cleanly_with_one_line(source: Path, tmp_path: 
 
 
 def test_nothing_to_record_is_said(aquaflow: Cli, tmp_path: Path) -> None:
-    refused(aquaflow("record", "--out", tmp_path / "out"), "--config")
+    refused(aquaflow("record", "--out", tmp_path / "out"), "--config", code=MISUSED)
     assert not (tmp_path / "out").exists()
 
 
@@ -87,7 +88,11 @@ def test_an_unknown_way_to_keep_pictures_is_refused(
     aquaflow: Cli, source: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    refused(aquaflow("record", "--source", source, "--out", out, "--picture", "gif"), "picture")
+    refused(
+        aquaflow("record", "--source", source, "--out", out, "--picture", "gif"),
+        "picture",
+        code=MISUSED,
+    )
 
 
 def test_a_full_disk_is_an_error_and_not_a_summary(

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from aquaflow.base.errors import ConfigError, InputError
+from aquaflow.base.errors import ArgumentError, ConfigError, InputError
 from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.recordings.images import ImageFolder
 from aquaflow.recordings.synthetic import SyntheticDive
+from aquaflow.sources import open_recording
 from aquaflow.types import Dropped, Frame
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -169,8 +170,8 @@ def test_binary_timestamps_are_one_sentence(folder):
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan")])
 def test_frame_rate_must_be_above_zero(folder, fps):
-    with pytest.raises(InputError, match="is not above zero"):
-        ImageFolder(folder, fps)
+    with pytest.raises(ArgumentError, match="is not above zero"):
+        open_recording(folder, fps)
 
 
 def test_folder_without_pictures_is_one_sentence(tmp_path):

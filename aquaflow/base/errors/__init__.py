@@ -18,7 +18,11 @@ class InputError(AquaFlowError):
 
 
 class ConfigError(AquaFlowError):
-    """A config or calibration file with an unknown key or a value out of range."""
+    """A setting that is unknown or out of range, in a config or calibration file or an option."""
+
+
+class ArgumentError(ConfigError):
+    """An option's value, or options together, that no file could make right."""
 
 
 class NotMappedError(AquaFlowError):

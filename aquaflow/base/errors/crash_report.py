@@ -1,7 +1,7 @@
 """The last net of the command line: every failure of a command is one sentence and an exit code.
 
-1: the input or the machine, and what to do about it. 70: a mistake in AquaFlow, reported as such;
-its traceback is kept in a file for the developers.
+1: the input or the machine, and what to do about it. 2: a wrong argument. 70: a mistake in
+AquaFlow, reported as such; its traceback is kept in a file for the developers.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TextIO
 from aquaflow import __version__
 from aquaflow.base.errors import (
     AquaFlowError,
+    ArgumentError,
     InputError,
     is_out_of_memory,
     printable,
@@ -29,6 +30,8 @@ DEBUG = "AQUAFLOW_DEBUG"
 
 FAILED = 1
 """Exit status after an error."""
+MISUSED = 2
+"""After a wrong argument, as of Typer's own checks."""
 OUR_MISTAKE = 70
 """EX_SOFTWARE of sysexits.h."""
 INTERRUPTED = 130
@@ -58,7 +61,7 @@ def one_sentence() -> Iterator[None]:
 def said_of(error: Exception) -> tuple[str, int]:
     """What the user reads of ``error``, and the exit code."""
     if isinstance(error, AquaFlowError):
-        return str(error), FAILED
+        return str(error), MISUSED if isinstance(error, ArgumentError) else FAILED
     if isinstance(error, BrokenPipeError):
         return "whatever read the output has gone", FAILED
     if isinstance(error, OSError) and error.strerror:

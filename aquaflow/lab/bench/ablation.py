@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.base.errors import AquaFlowError, ArgumentError
 from aquaflow.config.presets import merge
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.job import BenchJob
@@ -167,11 +167,13 @@ def parts_called(names: Sequence[str]) -> list[AblatedPart]:
     """The full system, and the parts whose names contain one of ``names``; all without any.
 
     Raises:
-        InputError: a name is of no part.
+        ArgumentError: a name is of no part.
     """
     for name in names:
         if not any(name in part.name for part in PARTS):
-            raise InputError(f"no part is called '{name}'; give a word of the table's first column")
+            raise ArgumentError(
+                f"no part is called '{name}'; give a word of the table's first column"
+            )
     chosen = [part for part in PARTS[1:] if any(name in part.name for name in names)]
     return [PARTS[0], *(chosen if names else PARTS[1:])]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.config.presets import preset
 from aquaflow.lab.bench import machine
@@ -32,12 +32,13 @@ def scenes_of(
     """The scenes of a suite, and those the user names.
 
     Raises:
-        InputError: there is nothing to run, or something named is not there.
+        ArgumentError: there is nothing to run, or no such suite.
+        InputError: something named is not there.
     """
     if suite not in (None, *SUITES):
-        raise InputError(f"there is no suite '{suite}'; choose {' or '.join(SUITES)}")
+        raise ArgumentError(f"there is no suite '{suite}'; choose {' or '.join(SUITES)}")
     if suite == "real" and data is None:
-        raise InputError(
+        raise ArgumentError(
             "--suite real needs a data folder: aquaflow lab bench --suite real DATA_DIR"
         )
     found = [scene_at(path) for path in paths]
@@ -46,7 +47,9 @@ def scenes_of(
     elif suite == "real" and data is not None:
         found += real_scenes(data)
     if not found:
-        raise InputError("nothing to run: give --suite ci, --suite real DATA_DIR, or --scene PATH")
+        raise ArgumentError(
+            "nothing to run: give --suite ci, --suite real DATA_DIR, or --scene PATH"
+        )
     return found
 
 
@@ -54,7 +57,7 @@ def contenders_of(presets: Sequence[str], peers: bool) -> list[Contender]:
     """The presets in their order, then the peers.
 
     Raises:
-        ConfigError: there is no such preset.
+        ArgumentError: there is no such preset.
     """
     for name in presets:
         preset(name)

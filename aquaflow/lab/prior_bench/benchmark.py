@@ -11,7 +11,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.config import PriorConfig
-from aquaflow.config.stage import validate
+from aquaflow.config.stage import COMMAND_LINE, validate
 from aquaflow.lab.bench import machine
 from aquaflow.lab.evaluation.matching import LEVELS, Picture, homography_recall, matcher_of
 from aquaflow.lab.prior_bench.latency import BenchmarkedPrior, latency_rows, sea_floor
@@ -67,7 +67,7 @@ def _contender(folder: Path, precision: str, threads: int, device: str) -> Bench
         "kind": "folder", "folder": folder, "device": device, "precision": precision,
         "threads": threads,
     }  # fmt: skip
-    prior = make_prior(validate(PriorConfig, config, "command line"))
+    prior = make_prior(validate(PriorConfig, config, COMMAND_LINE))
     name = prior.name if folder == SHIPPED else f"{prior.name} in {folder}"
     return BenchmarkedPrior(name, precision, threads, prior)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import Config, PriorConfig, parse_config
 from aquaflow.config.presets import merge
-from aquaflow.config.stage import validate
+from aquaflow.config.stage import COMMAND_LINE, validate
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.bench import machine
@@ -80,7 +80,7 @@ def methods_here(device: str) -> Methods:
     usable: list[Method] = [DenseMethod("classical", make_prior(PriorConfig(kind="classical")))]
     missing = []
     settings = {"kind": "compact", "device": device}
-    compact = make_prior(validate(PriorConfig, settings, "command line"))
+    compact = make_prior(validate(PriorConfig, settings, COMMAND_LINE))
     if compact.name == "compact":
         usable.append(DenseMethod("compact", compact))
     else:

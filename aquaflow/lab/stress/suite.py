@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import torch
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
 from aquaflow.lab.stress.case import REGISTRY, Case, StressOutcome
 
 FAMILIES = (
@@ -60,15 +60,17 @@ def cases(family: str | None = None, name: str | None = None, long: bool = False
     """The registered cases, in the order of the families.
 
     Raises:
-        InputError: there is no such family or case.
+        ArgumentError: there is no such family or case.
     """
     for module in _MODULES:
         import_module(f"aquaflow.lab.stress.{module}")
     if family is not None and family not in FAMILIES:
-        raise InputError(f"there is no family '{family}'; families are {', '.join(FAMILIES)}")
+        raise ArgumentError(f"there is no family '{family}'; families are {', '.join(FAMILIES)}")
     if name is not None:
         if name not in REGISTRY:
-            raise InputError(f"there is no stress case '{name}'; `aquaflow lab stress` lists them")
+            raise ArgumentError(
+                f"there is no stress case '{name}'; `aquaflow lab stress` lists them"
+            )
         return [REGISTRY[name]]
     chosen = [case for case in REGISTRY.values() if family in {None, case.family}]
     return [case for case in chosen if long or not case.long]

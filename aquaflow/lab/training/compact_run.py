@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.lab.networks.compact.export import export
 from aquaflow.lab.networks.compact.network import CompactPrior
 from aquaflow.lab.training.compact import CompactSettings, CompactTask
@@ -150,14 +150,15 @@ def device_called(name: str) -> torch.device:
     """cpu, cuda or cuda:N.
 
     Raises:
-        InputError: torch knows no such device, or it is not here.
+        ArgumentError: torch knows no such device.
+        InputError: it is not here.
     """
     try:
         device = torch.device(name)
     except RuntimeError as error:
-        raise InputError(f"there is no device '{name}'; give cpu or cuda") from error
+        raise ArgumentError(f"there is no device '{name}'; give cpu or cuda") from error
     if device.type not in ("cpu", "cuda"):
-        raise InputError(f"training on '{name}' is not supported; give cpu or cuda")
+        raise ArgumentError(f"training on '{name}' is not supported; give cpu or cuda")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise InputError(f"torch finds no GPU for device '{name}'; give cpu")
     return device

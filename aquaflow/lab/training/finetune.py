@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.lab.networks.mast3r.network import Mast3r
 from aquaflow.lab.training.datasets.chaining import chain
@@ -141,9 +141,9 @@ class FineTuningSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises InputError where a step's batches do not come out even."""
+        """Raises ArgumentError where a step's batches do not come out even."""
         if self.effective_batch % self.batch:
-            raise InputError(
+            raise ArgumentError(
                 f"{self.effective_batch} pairs of a step cannot be cut into batches of "
                 f"{self.batch}; give a --batch that divides --effective-batch"
             )
@@ -402,13 +402,14 @@ def read_data(specs: Sequence[str]) -> list[Frames]:
     """Every sequence of data sets given as KIND=FOLDER.
 
     Raises:
-        InputError: a kind is unknown, or a folder does not hold that data set.
+        ArgumentError: a kind is unknown.
+        InputError: a folder does not hold that data set.
     """
     sequences = []
     for spec in specs:
         kind, _, folder = spec.partition("=")
         if kind not in READERS or not folder:
-            raise InputError(
+            raise ArgumentError(
                 f"'{spec}' is no data set; give KIND=FOLDER, KIND one of {', '.join(READERS)}"
             )
         sequences += [replace(frames, kind=kind) for frames in READERS[kind](Path(folder))]

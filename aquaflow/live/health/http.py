@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeAlias
 from urllib.parse import parse_qs, urlsplit
 
 from aquaflow import __version__
-from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors import ArgumentError, InputError, reason_of
 from aquaflow.config.service import ListenConfig
 from aquaflow.live.control import RefusedError, ServiceControl, ServiceRequest
 from aquaflow.live.health.exposition import TYPE, device_lines, head, label, sample
@@ -369,7 +369,7 @@ def _address(url: str) -> tuple[str, int]:
     """Host and port.
 
     Raises:
-        InputError: it is no address of a service.
+        ArgumentError: it is no address of a service.
     """
     try:
         parts = urlsplit(url)
@@ -378,4 +378,4 @@ def _address(url: str) -> tuple[str, int]:
             return host, 80 if port is None else port
     except ValueError:
         pass
-    raise InputError(f"'{url[:SHOWN]}' is no address such as http://127.0.0.1:8230")
+    raise ArgumentError(f"'{url[:SHOWN]}' is no address such as http://127.0.0.1:8230")

@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import view_of_frame
 from aquaflow.geometry.earth import north_east
@@ -61,7 +61,7 @@ def parse_point(text: str) -> Asked:
     """What a text says.
 
     Raises:
-        InputError: it is no point.
+        ArgumentError: it is no point.
     """
     found = _ON_EARTH.fullmatch(text.replace(" ", "").upper())
     try:
@@ -81,7 +81,7 @@ def parse_point(text: str) -> Asked:
                 return MapPoint(*numbers)
     except ValueError:
         pass
-    raise InputError(
+    raise ArgumentError(
         f"{text[:80]!r} is no point; give x,y,z of the map, FRAME:u,v of a picture, or "
         "63.4305N,10.3951E"
     )

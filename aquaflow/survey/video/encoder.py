@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.base.storage.atomic import fresh_file
 
 SUFFIX, CODEC = ".mp4", "vp09"
@@ -93,10 +93,10 @@ def check_name(path: Path) -> None:
     """Before anything is drawn for it.
 
     Raises:
-        InputError: the file would have another ending than AquaFlow writes.
+        ArgumentError: the file would have another ending than AquaFlow writes.
     """
     if path.suffix.lower() != SUFFIX:
-        raise InputError(f"{path} must end in {SUFFIX}: AquaFlow writes VP9 in MP4")
+        raise ArgumentError(f"{path} must end in {SUFFIX}: AquaFlow writes VP9 in MP4")
 
 
 @contextlib.contextmanager

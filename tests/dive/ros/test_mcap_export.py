@@ -21,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.dive.point_cloud import read_point_cloud, read_posed_views
 from aquaflow.dive.restored import restored_frames, tone_without_water
@@ -332,4 +333,4 @@ def test_the_command_says_what_lengths_and_times_are(
     assert said["out"] == str(out)
     assert said["unit"] == "m"
     assert Path(said["layout"]).is_file()
-    refused(command("export", small_dive, "--format", "mcap", "--water"), "--water")
+    refused(command("export", small_dive, "--format", "mcap", "--water"), "--water", code=MISUSED)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from aquaflow.base.errors import ConfigError, InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.base.storage.archive import write_facts_file
 from aquaflow.cli import app
 from aquaflow.geometry.arrays import add_prefix
@@ -65,9 +65,9 @@ def test_a_survey_without_a_map_is_tracked_only(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_run_is_refused_before_anything_runs(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--frames 10 is too short"):
+    with pytest.raises(ArgumentError, match="--frames 10 is too short"):
         bm.jobs_of([1000, 10], 160, "fast", False, tmp_path)
-    with pytest.raises(ConfigError, match="no preset 'faster'"):
+    with pytest.raises(ArgumentError, match="no preset 'faster'"):
         bm.jobs_of([1000], 160, "faster", False, tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="give another --out"):

@@ -15,6 +15,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from aquaflow.base.errors import AquaFlowError, NotMappedError
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.cli import app
 from aquaflow.config.presets import FOR_A_GPU
 from aquaflow.lab.bench import machine, meter, worker
@@ -303,7 +304,7 @@ def test_both_commands_refuse_in_one_sentence_and_write_nothing(
 ) -> None:
     out = tmp_path / "out"
     refused(command(*words, "--device", "cuda", "--out", out), "--device cuda", "--device cpu")
-    refused(command(*words, "--device", "gpu", "--out", out), "use one of cpu, cuda")
+    refused(command(*words, "--device", "gpu", "--out", out), "use one of cpu, cuda", code=MISUSED)
     assert not out.exists()
 
 

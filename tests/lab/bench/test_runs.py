@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aquaflow.base.errors import ConfigError, InputError
+from aquaflow.base.errors import ArgumentError, InputError
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.lab.bench import ablation
 from aquaflow.lab.bench.benchmark import benchmark, contenders_of, scenes_of
 from aquaflow.lab.bench.job import BenchJob
@@ -142,14 +143,14 @@ def test_a_worker_that_fails_or_crashes_is_a_row(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no preset"):
+    with pytest.raises(ArgumentError, match="no preset"):
         contenders_of(["slow"], peers=False)
     for suite, data, said in (
         (None, None, "nothing to run"),
         ("real", None, "needs a data folder"),
         ("ic", None, "no suite"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(ArgumentError, match=said):
             scenes_of(suite, data, [], tmp_path, quiet)
 
 
@@ -170,7 +171,7 @@ def test_rows_are_chosen_by_a_word_of_their_name() -> None:
     chosen = [part.name for part in ablation.parts_called(["joint adjustment", "overlays"])]
     assert chosen == ["full", "without masking of overlays", "without joint adjustment"]
     assert ablation.parts_called([]) == list(ablation.PARTS)
-    with pytest.raises(InputError, match="no part is called 'magic'"):
+    with pytest.raises(ArgumentError, match="no part is called 'magic'"):
         ablation.parts_called(["overlays", "magic"])
 
 
@@ -239,7 +240,7 @@ def test_bench_on_a_small_dive(small_recording: Path, tmp_path: Path) -> None:
 
 def test_the_command_refuses_in_one_sentence() -> None:
     ran = run_aquaflow("lab", "bench", "--suite", "real")
-    assert ran.code == 1
+    assert ran.code == MISUSED
     assert ran.err.splitlines() == [
         "aquaflow: --suite real needs a data folder: aquaflow lab bench --suite real DATA_DIR"
     ]

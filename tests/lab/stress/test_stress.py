@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry import camera, similarity, two_view
 from aquaflow.geometry.similarity import Sim3
@@ -216,5 +217,5 @@ def test_the_command_prints_a_table_and_json(aquaflow: Cli) -> None:
 
 
 def test_an_unknown_family_or_case_is_refused(aquaflow: Cli) -> None:
-    refused(aquaflow("lab", "stress", "--family", "weather"), "weather")
-    refused(aquaflow("lab", "stress", "--case", "weather"), "weather")
+    refused(aquaflow("lab", "stress", "--family", "weather"), "weather", code=MISUSED)
+    refused(aquaflow("lab", "stress", "--case", "weather"), "weather", code=MISUSED)

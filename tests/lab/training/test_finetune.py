@@ -20,7 +20,7 @@ import torch
 from typer.testing import CliRunner
 
 from aquaflow import cli
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.lab.networks.mast3r import export as weights
 from aquaflow.lab.networks.mast3r.network import TINY, Mast3r
 from aquaflow.lab.training import finetune
@@ -191,7 +191,7 @@ def test_a_step_is_the_same_on_any_number_of_processes(pairs: MinedPairs, count:
 
 
 def test_batches_that_do_not_come_out_even_are_refused() -> None:
-    with pytest.raises(InputError, match="cut into batches of 3; give a --batch"):
+    with pytest.raises(ArgumentError, match="cut into batches of 3; give a --batch"):
         FineTuningSettings(batch=3)
 
 
@@ -256,7 +256,7 @@ def test_pictures_that_never_overlap_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("spec", ["tartanair", "kitti=/data", "=/data", ""])
 def test_a_data_set_that_is_not_known_is_refused(spec: str) -> None:
-    with pytest.raises(InputError, match="give KIND=FOLDER"):
+    with pytest.raises(ArgumentError, match="give KIND=FOLDER"):
         read_data([spec])
 
 

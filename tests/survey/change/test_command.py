@@ -8,26 +8,27 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.crash_report import FAILED, MISUSED
 from aquaflow.survey.change.find_changes import refuse_taken
 from tests.command_line import Cli
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "said", "code"),
     [
-        (["--from", "nowhere", "--to", "nowhere"], "there is no folder nowhere"),
-        (["--from", "a", "--to", "b", "--cylinder", "-1"], "--cylinder -1 is no length"),
-        (["--from", "a", "--to", "b", "--reach", "nan"], "--reach nan is no length"),
-        (["--from", "a", "--to", "b", "--false", "0"], "--false 0 is no share"),
-        (["nowhere", "--from", "a", "--to", "b"], "nowhere is no site"),
-        (["S", "--from", "a", "--to", "b", "--transform", "T"], "leave out --transform"),
+        (["--from", "nowhere", "--to", "nowhere"], "there is no folder nowhere", FAILED),
+        (["--from", "a", "--to", "b", "--cylinder", "-1"], "--cylinder -1 is no length", MISUSED),
+        (["--from", "a", "--to", "b", "--reach", "nan"], "--reach nan is no length", MISUSED),
+        (["--from", "a", "--to", "b", "--false", "0"], "--false 0 is no share", MISUSED),
+        (["nowhere", "--from", "a", "--to", "b"], "nowhere is no site", FAILED),
+        (["S", "--from", "a", "--to", "b", "--transform", "T"], "leave out --transform", MISUSED),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_sentence(
-    command: Cli, arguments: list[str], said: str
+    command: Cli, arguments: list[str], said: str, code: int
 ) -> None:
     ran = command("change", *arguments)
-    assert ran.code == 1
+    assert ran.code == code
     assert said in ran.err
     assert "Traceback" not in ran.err
     assert len(ran.err.strip().splitlines()) == 1

@@ -12,7 +12,7 @@ import pytest
 from pyproj import CRS, Geod, Transformer
 from typer.testing import CliRunner
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.cli import app
 from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive
@@ -168,5 +168,5 @@ def test_the_command_writes_into_the_dive_and_says_where_the_points_lie(dive: Pa
 def test_an_option_of_another_format_is_refused(dive: Path) -> None:
     asked = ["export", str(dive), "--format", "restored", "--water"]
     result = CliRunner().invoke(app, asked)
-    assert isinstance(result.exception, InputError)
+    assert isinstance(result.exception, ArgumentError)
     assert "knows no --water" in str(result.exception)

@@ -15,7 +15,7 @@ import torch
 from scipy.ndimage import map_coordinates
 from typer.testing import CliRunner
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.cli import app
 from aquaflow.cli.export import ExportFormat
 from aquaflow.dive.dive import Dive
@@ -296,7 +296,7 @@ def test_options_that_do_not_go_together_are_refused(
     dive: Path, options: list[str], sentence: str
 ) -> None:
     ran = CliRunner().invoke(app, ["export", str(dive), "--format", *options])
-    assert isinstance(ran.exception, InputError)
+    assert isinstance(ran.exception, ArgumentError)
     assert sentence in str(ran.exception)
 
 

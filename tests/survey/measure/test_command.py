@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError
+from aquaflow.base.errors.crash_report import FAILED, MISUSED
 from aquaflow.dive.placement import to_geodetic
 from aquaflow.survey.measure.asked import GeodeticPoint, MapPoint, Pixel, parse_point
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
@@ -167,7 +168,7 @@ def test_points_are_read_as_they_are_typed(text: str, point: object) -> None:
     ],
 )
 def test_what_is_no_point_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="is no point"):
+    with pytest.raises(ArgumentError, match="is no point"):
         parse_point(text)
 
 
@@ -193,7 +194,9 @@ def test_what_cannot_be_measured_is_one_sentence(
     options: tuple[str, ...], sentence: str, dive: Path, command: Cli
 ) -> None:
     ran = command("measure", dive, *options)
-    assert ran.code == 1
+    assert ran.code == (
+        MISUSED if sentence.endswith((" no size", ".csv", "need points")) else FAILED
+    )
     assert len(ran.err.strip().splitlines()) == 1
     assert re.search(sentence, ran.err)
 

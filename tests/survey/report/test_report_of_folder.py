@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.report.report_of import report_of
@@ -60,9 +61,8 @@ def test_the_ground_in_numbers_is_that_of_the_page_until_its_unit_changes(dive: 
 
 def test_a_report_is_never_written_over_what_is_no_pdf(dive: Path, command: Cli) -> None:
     before = (dive / "camera.yaml").read_bytes()
-    refused(
-        command("export", "report", dive, "--pdf", dive / "camera.yaml"), "does not end in .pdf"
-    )
+    ran = command("export", "report", dive, "--pdf", dive / "camera.yaml")
+    refused(ran, "does not end in .pdf", code=MISUSED)
     assert (dive / "camera.yaml").read_bytes() == before
 
 

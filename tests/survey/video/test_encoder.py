@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.survey.video.encoder import VideoEncoder, video_file
 from aquaflow.survey.video.overlay import Timeline, usual_fps
 from tests.survey.video.player import stated_times
@@ -118,7 +118,7 @@ def test_a_video_without_a_picture_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.avi", "a", "missing/a.mp4"])
 def test_a_name_that_cannot_be_written_is_one_sentence(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="a"), video_file(tmp_path / name, 25.0):
+    with pytest.raises(AquaFlowError, match="a"), video_file(tmp_path / name, 25.0):
         pytest.fail("began to write")
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.dive.deliverables import read_finished_frames
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.restored import restored_frames, seen_frames, tone_without_water
@@ -257,15 +258,17 @@ def test_the_command_says_what_it_wrote_and_refuses_what_makes_no_sense(
     assert json.loads(ran.out) == {"out": str(out), "frames": 5}
     assert len(pictures_of(out)) == 5
     other = ("--out", tmp_path / "b.mp4")
-    refused(command("export", "video", small_dive, "--water", *other), "--water")
+    refused(command("export", "video", small_dive, "--water", *other), "--water", code=MISUSED)
     refused(command("export", "video", small_dive, "--kind", "restored", *other), "--recording")
-    refused(command("export", "video", small_dive, "--out", tmp_path / "b.avi"), "b.avi", ".mp4")
+    ran = command("export", "video", small_dive, "--out", tmp_path / "b.avi")
+    refused(ran, "b.avi", ".mp4", code=MISUSED)
     for wrong in ("0", "nan", "1e9"):
         flight = ("--kind", "fly-through", "--seconds", wrong)
-        refused(command("export", "video", small_dive, *flight, *other), "--seconds")
+        refused(command("export", "video", small_dive, *flight, *other), "--seconds", code=MISUSED)
     refused(
         command("export", "video", small_dive, "--kind", "fly-through", "--width", "8", *other),
         "--width",
+        code=MISUSED,
     )
     refused(command("export", "video", tmp_path, *other), "no finished dive")
     assert [path.name for path in tmp_path.glob("*.mp4")] == ["fly.mp4"]

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.growth.job import GrowthJob
@@ -66,11 +66,10 @@ def jobs_of(
     """A job for each number of frames, the shortest first.
 
     Raises:
-        InputError: a survey is too short for a map.
-        ConfigError: there is no such preset.
+        ArgumentError: a survey is too short for a map, or there is no such preset.
     """
     if min(frames) < LEAST_FRAMES:
-        raise InputError(f"--frames {min(frames)} is too short; give at least {LEAST_FRAMES}")
+        raise ArgumentError(f"--frames {min(frames)} is too short; give at least {LEAST_FRAMES}")
     jobs = [
         GrowthJob(count, width, str(out / f"dive_{count}"), preset, tracking_only)
         for count in sorted(set(frames))

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors import ArgumentError, InputError, reason_of
 from aquaflow.lab.networks.mast3r.network import (
     FULL,
     PATCH_PX,
@@ -75,10 +75,13 @@ def export(
     """Write the prior to ``folder`` for pictures of ``width`` x ``height`` px; returns its card.
 
     Raises:
-        InputError: the sides are no multiples of 16 px, or ``folder`` is not empty.
+        ArgumentError: the sides are no multiples of 16 px.
+        InputError: ``folder`` is not empty.
     """
     if width % PATCH_PX or height % PATCH_PX or min(width, height) <= 0:
-        raise InputError(f"{width} x {height} px is no size of tokens; use multiples of {PATCH_PX}")
+        raise ArgumentError(
+            f"{width} x {height} px is no size of tokens; use multiples of {PATCH_PX}"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(f"{folder} is not empty; give a new folder")

@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from aquaflow.base.errors.crash_report import MISUSED
 from aquaflow.cli import app
 from aquaflow.lab.bench.render import benchmark as bm
 from aquaflow.lab.bench.render import peak as peaks
@@ -119,8 +120,8 @@ def test_bench_still_takes_a_suite_and_a_folder_in_any_order(
 
 
 def test_what_is_neither_a_command_nor_a_suite_is_refused() -> None:
-    refused(run_aquaflow("lab", "bench", "rendr"), "rendr", "render")
-    refused(run_aquaflow("lab", "bench"), "nothing to run")
+    refused(run_aquaflow("lab", "bench", "rendr"), "rendr", "render", code=MISUSED)
+    refused(run_aquaflow("lab", "bench"), "nothing to run", code=MISUSED)
 
 
 def test_bench_render_refuses_in_one_sentence(tmp_path: Path) -> None:

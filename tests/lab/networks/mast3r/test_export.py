@@ -15,7 +15,7 @@ import torch
 from typer.testing import CliRunner
 
 from aquaflow import cli
-from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.base.errors import AquaFlowError, ArgumentError, InputError
 from aquaflow.config import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.lab.networks.mast3r.export import OUTPUTS, export, parity_of, relative_difference
@@ -98,7 +98,7 @@ def test_difference_is_relative_to_the_largest_value() -> None:
 def test_a_size_that_is_no_multiple_of_16_is_refused(
     width: int, height: int, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match="multiples of 16"):
+    with pytest.raises(ArgumentError, match="multiples of 16"):
         export(tiny(), tmp_path / "out", width, height, "none", silent)
 
 
