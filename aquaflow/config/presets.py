@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import ArgumentError
 from aquaflow.config import Config, load_config, parse_config
+
+log = logging.getLogger(__name__)
 
 PRESETS: dict[str, dict[str, Any]] = {
     "fast": {
@@ -109,10 +113,37 @@ def load_configured(
         InputError: the file cannot be read.
         ConfigError: an unknown preset or key, or a value out of range, in the file or ``origin``.
     """
-    base = (Config() if path is None else load_config(path)).model_dump()
-    if preset_name is not None:
-        base = merge(base, preset(preset_name))
-    return parse_config(merge(base, overrides), origin)
+    written = {} if path is None else load_config(path).model_dump(exclude_unset=True)
+    return parse_config(merge(with_preset(written, preset_name, path), overrides), origin)
+
+
+def with_preset(written: dict[str, Any], name: str | None, path: Path | None) -> dict[str, Any]:
+    """What the file ``path`` sets, and on top of it the preset; a logged sentence names the keys
+    that the preset changes. A file cannot win: those that a dive or `aquaflow config` writes hold
+    every key, so that a preset on top of one would do nothing.
+
+    Raises:
+        ArgumentError: there is no such preset.
+    """
+    if name is None:
+        return written
+    changes = preset(name)
+    replaced = [f"{key} ({new} for {old})" for key, old, new in _replaced(written, changes)]
+    if replaced:
+        log.warning("the preset '%s' replaces settings of %s: %s", name, path, ", ".join(replaced))
+    return merge(written, changes)
+
+
+def _replaced(
+    written: dict[str, Any], changes: dict[str, Any], stage: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """Each key that ``written`` sets and ``changes`` sets to something else, and both values."""
+    for key in filter(written.__contains__, changes):
+        old, new = written[key], changes[key]
+        if isinstance(old, dict) and isinstance(new, dict):
+            yield from _replaced(old, new, f"{stage}{key}.")
+        elif old != new:
+            yield f"{stage}{key}", old, new
 
 
 def merge(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from aquaflow.config import Config, read_yaml
 from aquaflow.config.cameras import CameraConfig
-from aquaflow.config.presets import merge, preset
+from aquaflow.config.presets import with_preset
 from aquaflow.config.service import RecordingConfig, ServiceConfig, ViewerConfig
 from aquaflow.config.stage import understood, validate
 from aquaflow.config.telemetry import TelemetryConfig
@@ -32,8 +32,9 @@ def load_vehicle(path: Path | None, preset_name: str | None = None) -> VehicleCo
         ConfigError: an unknown preset or key, or a value out of range.
     """
     written = {} if path is None else understood(VehicleConfig, read_yaml(path), str(path))
-    changed = {} if preset_name is None else preset(preset_name)
-    return validate(VehicleConfig, merge(written, changed), str(path or preset_name))
+    return validate(
+        VehicleConfig, with_preset(written, preset_name, path), str(path or preset_name)
+    )
 
 
 def load_any(path: Path) -> Config:

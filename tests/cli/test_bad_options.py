@@ -188,6 +188,19 @@ def test_wrong_arguments_are_told_from_bad_files_by_their_exit_code(
     refused(aquaflow(*(paths.get(word, word) for word in words)), code=MISUSED)
 
 
+def test_a_preset_says_which_settings_of_a_config_it_replaces(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("tracking: {matches: 900}\nsource: {stop: 3, width: 128}\n")
+    given = ("map", small_recording, "--config", file, "--tracking-only", "--out", tmp_path / "out")
+    ran = aquaflow(*given, "--preset", "fast")
+    assert f"the preset 'fast' replaces settings of {file}: tracking.matches (2500 for 900)\n" in (
+        ran.err
+    )
+    assert "replaces" not in aquaflow(*given, "--preset", "balanced", "--overwrite").err
+
+
 # --- folders to write to and to read from ---------------------------------------------------------
 
 
