@@ -273,3 +273,32 @@ def test_a_name_that_is_not_there_is_found_out(name: str, defined: bool) -> None
 )
 def test_a_setting_that_is_not_there_is_found_out(key: str, known: bool) -> None:
     assert is_setting(key) is known
+
+
+# --- what users are told, who have no checkout ----------------------------------------------------
+
+IN_THE_CHECKOUT = re.compile(r"\b(docs|tests|examples)/\w|\bnotes/\d|\b\w+/\w+\.py\b|README")
+
+
+def messages(tree: ast.Module) -> Iterator[str]:
+    """Texts of a module that are neither documentation nor descriptions of settings."""
+    documentation = {
+        id(node.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr)
+        or (isinstance(node, ast.keyword) and node.arg == "description")
+    }
+    for node in ast.walk(tree):
+        is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if is_text and id(node) not in documentation:
+            yield node.value
+
+
+def test_no_message_sends_a_user_to_a_file_of_the_repository() -> None:
+    cited = [
+        f"{path.relative_to(ROOT)}: {text}"
+        for path in sorted((ROOT / "aquaflow").rglob("*.py"))
+        for text in messages(ast.parse(path.read_text(encoding="utf-8")))
+        if IN_THE_CHECKOUT.search(text)
+    ]
+    assert not cited, "\n".join(cited)

@@ -144,7 +144,10 @@ def compare(
 def train_mast3r(
     checkpoint: Annotated[Path, typer.Option(help="Weights to start from, which you bring.")],
     data: Annotated[
-        list[str], typer.Option(help="KIND=FOLDER; may be repeated; see docs/prior.md.")
+        list[str],
+        typer.Option(
+            help="KIND=FOLDER, KIND tartanair, mimir, uwstereo, flsea or colmap; may be repeated."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of pairs, checkpoint, curve and weights.")],
     width: Annotated[int, typer.Option(help="px of the pictures, a multiple of 16.")] = 512,

@@ -138,11 +138,11 @@ def _failure(what: str, error: RuntimeError) -> str:
     if what == "torch":
         return (
             f"torch {gpu.torch} has kernels for {', '.join(gpu.kernels)} and not for compute "
-            f"capability {gpu.capability}; install a build that has them (docs/gpu.md)"
+            f"capability {gpu.capability}; install a build that has them"
         )
     return (
         f"gsplat's kernels were not compiled for compute capability {gpu.capability}; compile them "
-        f"with TORCH_CUDA_ARCH_LIST={gpu.capability} (docs/gpu.md)"
+        f"with TORCH_CUDA_ARCH_LIST={gpu.capability}"
     )
 
 

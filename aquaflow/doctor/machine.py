@@ -169,7 +169,7 @@ def _absent(machine: MachineProbes, reason: str, others: bool) -> CheckResult:
         "GPU",
         "an NVIDIA driver, but torch cannot use the GPU",
         "maps are drawn on the processor",
-        f"{reason}; install a build of torch that fits the driver (docs/gpu.md)",
+        f"{reason}; install a build of torch that fits the driver",
     )
 
 

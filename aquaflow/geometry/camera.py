@@ -216,7 +216,8 @@ def load_camera(path: Path, inside: bool = False) -> CameraModel:
     """
     data = None if inside else values_of_file(path)
     if data is None:
-        data = read_mapping(path, "calibration", "compare it with docs/formats.md", inside)
+        hint = "write width, height, fx, fy, cx and cy, each as `key: value`"
+        data = read_mapping(path, "calibration", hint, inside)
         data = values_of_yaml(path, data) or data
     if (model := MODELS.get(str(data.get("distortion_model")).lower())) is not None:
         data["distortion_model"] = model

@@ -144,9 +144,9 @@ MOST_TILT = np.cos(np.radians(45.0))
 
 MISSING = {
     "flat": "port: flat lacks its measures; write port: {kind: flat, distance_m: ..., "
-    "thickness_m: ...} as in docs/camera.md, or port: none for a camera calibrated in water",
+    "thickness_m: ...}, or port: none for a camera calibrated in water",
     "dome": "port: dome lacks its measures; write port: {kind: dome, radius_m: ..., "
-    "thickness_m: ..., centre_m: [x, y, z]} as in docs/camera.md, or port: none for a camera "
+    "thickness_m: ..., centre_m: [x, y, z]}, or port: none for a camera "
     "calibrated in water",
 }
 """What is said of a port that is only named."""
