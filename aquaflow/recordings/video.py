@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator
 from itertools import count, takewhile
@@ -11,7 +12,8 @@ import numpy as np
 
 from aquaflow.base.errors import printable
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
-from aquaflow.recordings.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
+from aquaflow.recordings.images import CALIBRATION, DEFAULT_FPS, NS_PER_S, SUBFOLDER
+from aquaflow.recordings.picture import EXTENSIONS as PICTURES
 from aquaflow.recordings.picture import UnreadablePictureError
 from aquaflow.recordings.video_decoder import VideoDecoder, read_index
 from aquaflow.sources import is_asked
@@ -48,15 +50,16 @@ class VideoFile:
     chapter of a GoPro recording brings the others.
     """
 
-    specificity = 1
+    specificity = 2
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
-        """Open the video and decode its first frame.
+        """Open the video, or the only one of a folder, and decode its first frame.
 
         Raises:
             InputError: the file is not a video, or no frame of it can be decoded.
             ConfigError: the ``camera.yaml`` next to it is malformed.
         """
+        path = video_of(path) or path
         self.path = path
         self.files = _chapters(path)
         self._facts: dict[str, str] = {}
@@ -77,7 +80,7 @@ class VideoFile:
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return path.is_file() and path.suffix.lower() in EXTENSIONS
+        return video_of(path) is not None
 
     @classmethod
     def open(cls, path: Path, fps: float | None = None) -> VideoFile:
@@ -210,6 +213,25 @@ class VideoFile:
 
 def _is_shape_of(camera: CameraModel, width: int, height: int) -> bool:
     return abs(camera.width / camera.height * height / width - 1.0) <= ASPECT_TOLERANCE
+
+
+def video_of(path: Path) -> Path | None:
+    """``path`` if it is a video, and of a folder without pictures the only one in it, of a GoPro
+    recording its first chapter; else None."""
+    if not path.is_dir():
+        return path if _is_video(path) else None
+    with contextlib.suppress(OSError):
+        files = sorted(file for file in path.iterdir() if not file.name.startswith("."))
+        if (path / SUBFOLDER).is_dir() or any(file.suffix.lower() in PICTURES for file in files):
+            return None
+        videos = list(filter(_is_video, files))
+        if videos and set(_chapters(videos[0])) == set(videos):
+            return videos[0]
+    return None
+
+
+def _is_video(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in EXTENSIONS
 
 
 def _chapters(path: Path) -> list[Path]:

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.geometry.camera import save_camera
 from aquaflow.recordings.images import ImageFolder
-from tests.command_line import Cli
+from tests.command_line import Cli, refused
 from tests.recordings.inputs import Dive, dive_of, made, write_plainly
 from tests.recordings.inputs.bags import Messages, pictures_of, write_bag
 
@@ -90,6 +91,22 @@ def test_a_bag_and_a_single_mcap_say_the_same(
     assert said.startswith("the calibration of /cam/image_raw is that of /cam/camera_info")
     kinds = [(each["kind"], each["read"], each["from_s"]) for each in found["telemetry"]]
     assert kinds == [("Depth", 1, 0.0), ("UtcTime", 1, pytest.approx(0.12))]
+
+
+def test_a_folder_with_one_video_and_its_calibration_is_that_video(
+    command: Cli, dive: Dive, tmp_path: Path
+) -> None:
+    folder = tmp_path / "reef"
+    folder.mkdir()
+    path = clip(folder / "clip.avi", dive)
+    save_camera(dive.camera, folder / "camera.yaml")
+    found = json.loads(command("inspect", folder, "--json").out)
+    assert (found["source"], found["pictures"]) == (str(folder), 14)
+    assert found["sources"]["calibration"] == f"the calibration is {folder / 'camera.yaml'}"
+    given = ("map", folder, "--tracking-only", "--every", 13, "--out", tmp_path / "out")
+    refused(command(*given), "reef has 2 usable frames")
+    path.with_suffix(".mkv").write_bytes(path.read_bytes())
+    refused(command("inspect", folder), "are camera.yaml, clip.avi, clip.mkv")
 
 
 def test_a_log_alone_and_what_holds_nothing(command: Cli, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from aquaflow.base.errors import AquaFlowError, InputError, printable, reason_of
 from aquaflow.lab.batch.object_store import ObjectStore, StoredObject, is_url
+from aquaflow.recordings.video import VideoFile
 from aquaflow.sources import camera_reader
 
 ANY_FOLDER = 1
@@ -71,6 +72,8 @@ def _in_folder(folder: Path, depth: int) -> list[Path]:
 
 def _is_recording(path: Path) -> bool:
     reader = camera_reader(path)
+    if reader is VideoFile:
+        return path.is_file()  # its folder is looked into: a dive has the name of its file
     if reader is None or not path.is_dir() or reader.specificity > ANY_FOLDER:
         return reader is not None
     try:  # every folder might be one of pictures
