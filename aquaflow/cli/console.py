@@ -60,6 +60,10 @@ PRESETS = (
 """Help of --preset; a test holds it to the presets that there are."""
 
 
+NOT_MAPPED = "aquaflow.live.live_dive"
+"""Logger of why nothing of a live dive could be mapped."""
+
+
 def duration(value: float | None) -> float | None:
     """An option in seconds that a clock can wait for.
 
@@ -156,11 +160,14 @@ class _Sentence(logging.Formatter):
         return printable_text(record.getMessage())
 
 
-def devices_on_stderr() -> None:
-    """Print what happens to devices as it happens: a terminal, and the journal of a service."""
+def live_on_stderr() -> None:
+    """Print what happens to devices as it happens, and why a dive was not mapped: on a terminal,
+    and in the journal of a service."""
     said = logging.StreamHandler()
     said.setFormatter(_Sentence())
-    said.addFilter(lambda record: "source" in getattr(record, "fields", {}))
+    said.addFilter(
+        lambda record: record.name == NOT_MAPPED or "source" in getattr(record, "fields", {})
+    )
     logging.getLogger("aquaflow").addHandler(said)
 
 

@@ -22,7 +22,7 @@ from aquaflow.cli.console import (
     Seconds,
     WhiteBalanceOption,
     checked_site,
-    devices_on_stderr,
+    live_on_stderr,
     progress_bars,
     table_console,
     unit_in_words,
@@ -102,8 +102,8 @@ def run(
 
     from aquaflow.live.onboard import map_live  # loads torch
 
+    live_on_stderr()
     if source is None:
-        devices_on_stderr()
         feed: Feed = devices(vehicle)
     else:
         calibration = None if calib is None else load_camera(calib)
@@ -143,6 +143,7 @@ def finish(
     """Finish a live dive whose process was killed: refine, evaluate, write every file."""
     from aquaflow.live.finish import FinishedAlreadyError, finish_dive  # loads torch
 
+    live_on_stderr()
     try:
         with progress_bars(quiet=as_json) as progress:
             finished = finish_dive(
@@ -268,6 +269,7 @@ def map_realtime(
     alone["health"]["enabled"], alone["mapping"]["refine_seconds"] = False, None
     vehicle = VehicleConfig.model_validate(settings.model_dump() | {"service": alone})
     feed = recording(source, vehicle, calibration=calibration)
+    live_on_stderr()
     with progress_bars(quiet=quiet) as progress:
         return map_live(
             feed, vehicle, out, progress=lambda done, total: progress("refine", done, total),

@@ -46,6 +46,9 @@ from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 log = logging.getLogger(__name__)
 
 
+FEW_FRAMES = 10
+"""A second of a dive: a map begins once the picture has moved by 4 % of its width."""
+
 UNCHECKED = (
     "whether the calibration fits could not be checked: too few keyframes see the same places "
     "while the camera turns"
@@ -312,12 +315,15 @@ class DiveRun:
         if read == 0:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
         if read < MIN_VIEWS:
-            return f"{self.name} has {read} usable frames; a map needs at least {MIN_VIEWS}"
+            frames = "frame" if read == 1 else "frames"
+            return f"{self.name} has {read} usable {frames}; a map needs at least {MIN_VIEWS}"
         if odd := self._check.oddities():
             return f"{self.name}: none of {read} frames could be placed: {'; '.join(odd)}"
+        few = f", for which {read} frames are few" if read < FEW_FRAMES else ""
         return (
-            f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
-            "the camera must move sideways, see frames.csv for each frame"
+            f"{self.name}: none of {read} frames could be placed"
+            f"{_most_common_reason(self.folder.rows, 'them')}; the pictures need texture and the "
+            f"camera must move sideways{few}; see frames.csv for each frame"
         )
 
     def _write(
@@ -438,21 +444,23 @@ def shortcomings(config: Config, rows: Sequence[FrameRow], gaussians: int) -> li
     posed = sum(row.sub_map is not None for row in rows)
     if posed < LEAST_POSED_SHARE * len(rows):
         found.append(
-            f"only {posed} of {len(rows)} frames have a pose{_most_common_reason(rows)}; take "
-            "frames closer together (a smaller --every), give a calibration (--calib), and see "
-            "frames.csv for each frame"
+            f"only {posed} of {len(rows)} frames have a pose"
+            f"{_most_common_reason(rows, 'the others')}; take frames closer together (a smaller "
+            "--every), give a calibration (--calib), and see frames.csv for each frame"
         )
     if config.mapping.enabled and gaussians == 0:
         found.append(f"the map is empty: it ends with 0 Gaussians; {_what_to_do(config)}")
     return found
 
 
-def _most_common_reason(rows: Sequence[FrameRow]) -> str:
-    reasons = Counter(row.reason for row in rows if row.sub_map is None and row.reason)
+def _most_common_reason(rows: Sequence[FrameRow], of: str) -> str:
+    """Why frames have no pose; of reasons that differ in a number alone, one stands for all."""
+    reasons = [row.reason for row in rows if row.sub_map is None and row.reason]
     if not reasons:
         return ""
-    reason, count = reasons.most_common(1)[0]
-    return f" ({count} of the others: {reason})"
+    kind, count = Counter(reason.partition(":")[0] for reason in reasons).most_common(1)[0]
+    example = next(reason for reason in reasons if reason.partition(":")[0] == kind)
+    return f" ({count} of {of}: {example})"
 
 
 def _what_to_do(config: Config) -> str:

@@ -146,6 +146,32 @@ def test_a_clip_of_three_frames_is_mapped_or_refused_with_its_name(
     assert len(rows(out)) == 3
 
 
+def test_black_motionless_and_short_clips_are_told_apart(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    random = np.random.default_rng(0)
+    scenes = [cv2.resize(random.uniform(0, 255, (15, 20, 3)), (160, 120)) for _ in range(3)]
+    first = cv2.imread(str(pictures(small_recording)[0]))
+    still = [first + random.normal(0.0, 1.0, first.shape) for _ in range(12)]
+    for name, frames, words in (
+        ("black", [np.zeros((120, 160, 3))] * 12, "12 of 12 pictures are nearly black"),
+        ("still", still, "of them: duplicate: moved by 0.0"),
+        ("short", scenes, "(3 of them: no pose found)"),
+    ):
+        path = tmp_path / f"{name}.avi"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (160, 120))
+        for frame in frames:
+            writer.write(np.clip(frame, 0, 255).astype(np.uint8))
+        writer.release()
+        ran = aquaflow("map", path, "--tracking-only", "--out", tmp_path / name)
+        assert ran.code == 1
+        assert words in ran.err
+        assert (", for which 3 frames are few" in ran.err) == (name == "short")
+    live = aquaflow("map", path, "--realtime", "--tracking-only", "--out", tmp_path / "live")
+    assert live.code == 3
+    assert live.err.startswith("live")  # how many of the frames that came, and why
+
+
 def test_a_clip_of_two_frames_is_too_short(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
