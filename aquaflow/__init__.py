@@ -15,7 +15,6 @@ Importing this package is cheap: torch, OpenCV and matplotlib load where they ar
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -31,10 +30,7 @@ if TYPE_CHECKING:
     from aquaflow.slam import Slam
     from aquaflow.types import Frame
 
-try:
-    __version__ = version("aquaflow")
-except PackageNotFoundError:  # imported from a checkout that was never installed
-    __version__ = "0+unknown"
+    __version__: str
 
 __all__ = [
     "AquaFlowError",
@@ -78,9 +74,21 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return _read_version()
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def _read_version() -> str:
+    # Takes longer to import than all before the command line catches Ctrl-C.
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("aquaflow")
+    except PackageNotFoundError:  # imported from a checkout that was never installed
+        return "0+unknown"
 
 
 def __dir__() -> list[str]:

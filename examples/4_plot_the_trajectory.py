@@ -39,4 +39,6 @@ def main(dive_folder: str, truth_file: str, plot: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     main(*sys.argv[1:])

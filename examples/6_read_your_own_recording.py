@@ -54,6 +54,8 @@ class NumpyRecording:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     recording, without_map = NumpyRecording(Path(sys.argv[1])), {"mapping": {"enabled": False}}
     found = aquaflow.map_recording(recording, sys.argv[2], settings=without_map)
     print(f"{len(found.trajectory)} of {len(found)} frames have a pose")

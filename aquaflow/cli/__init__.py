@@ -72,10 +72,10 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point: whatever a command raises becomes one sentence and an exit code."""
-    # What Python warns of is for the log of the dive, not for who flies it.
-    logging.captureWarnings(True)
-    print_anything((sys.stdout, sys.stderr))
     with one_sentence():
+        # What Python warns of is for the log of the dive, not for who flies it.
+        logging.captureWarnings(True)
+        print_anything((sys.stdout, sys.stderr))
         refuse_unreadable(sys.argv[1:])
         sys.argv[1:] = with_new_name(sys.argv[1:])
         app()

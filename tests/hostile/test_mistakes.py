@@ -89,13 +89,14 @@ def test_an_interrupt_keeps_its_exit_code_and_says_what_stays(failing: Cli) -> N
     )
 
 
-def test_an_interrupt_while_the_command_is_loaded_says_nothing() -> None:
+@pytest.mark.parametrize("module", ["importlib.metadata", "typer", "aquaflow.cli.export"])
+def test_an_interrupt_while_the_command_is_loaded_says_nothing(module: str) -> None:
     pressed = (
         "import os, signal, sys\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in a background
         "class Press:\n"
         "    def find_spec(self, name, *_):\n"
-        "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
+        f"        if name == '{module}': os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.meta_path.insert(0, Press())\n"
         "from aquaflow.__main__ import main\n"
         "main()\n"
