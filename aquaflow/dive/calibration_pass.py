@@ -243,7 +243,7 @@ class FoundCamera:
         """The lens as metrics.json has it; px of the mapped width."""
         focal, sigma = self.camera.fx, self.lens.sigma
         return {
-            "verdict": "found" if self.lens.known else "cannot be told",
+            "verdict": "found" if self.lens.known else UNTOLD,
             "used": self.used,
             "focal_px": round(focal, 2),
             "focal_sigma_px": round(focal * float(sigma[0]), 2),
@@ -335,6 +335,8 @@ REMEDY = (
     "have the focal length estimated from the dive; until then distances and shapes are distorted"
 )
 """What a user can do about a calibration that does not fit."""
+UNTOLD = "cannot be told"
+"""Verdict on a calibration where the dive's motion does not determine the lens."""
 
 
 def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
@@ -362,10 +364,15 @@ def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
 
 
 def verdict(error: LensError) -> str:
-    """One of ``wrong``, ``fits`` and ``cannot be told``."""
+    """One of ``wrong``, ``fits`` and ``UNTOLD``."""
     if error.wrong:
         return "wrong"
-    return "fits" if all(error.known) else "cannot be told"
+    return "fits" if all(error.known) else UNTOLD
+
+
+def can_tell(error: LensError | None) -> bool:
+    """Whether the dive shows if its calibration fits."""
+    return error is not None and verdict(error) != UNTOLD
 
 
 def warning(error: LensError, calibration: CameraModel) -> str:

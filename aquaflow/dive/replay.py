@@ -18,7 +18,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.recordings.playback import Event, Playback, read_past_failures
 from aquaflow.slam import Slam
-from aquaflow.sources import RecordedCamera, mounting_of, sources_of
+from aquaflow.sources import GIVEN, RecordedCamera, mounting_of, notes_with, sources_of
 from aquaflow.sources.telemetry_input import TelemetryInput
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.time_offset import (
@@ -135,11 +135,7 @@ def _replay(
         )
     synchronise(run, telemetry)
     run.sources = _sources(run, recording)
-    notes = recording.notes + telemetry.notes
-    if _is_given(run, recording):
-        # What became of one that lies beside the pictures does not matter then.
-        unused = sources_of(recording).get("calibration")
-        notes = [note for note in notes if note != unused]
+    notes = notes_with(recording, run.calibration) + telemetry.notes
     return run.finish(notes, lambda done, total: progress("refine", done, total))
 
 
@@ -149,14 +145,9 @@ def _sources(run: DiveRun, recording: RecordedCamera) -> dict[str, str]:
     if run.calibration is None:
         assumed = "no calibration: a focal length was assumed and refined"
         stated["calibration"] = "; ".join([*filter(None, [stated.get("calibration")]), assumed])
-    elif _is_given(run, recording):
-        stated["calibration"] = "the calibration was given beside the recording"
+    elif run.calibration is not recording.camera:
+        stated["calibration"] = GIVEN
     return stated
-
-
-def _is_given(run: DiveRun, recording: RecordedCamera) -> bool:
-    """True if the calibration is not the recording's own."""
-    return run.calibration is not None and run.calibration is not recording.camera
 
 
 def _events(run: DiveRun, playback: Playback, source: SourceConfig) -> Iterator[Event]:

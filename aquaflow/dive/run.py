@@ -347,7 +347,7 @@ class DiveRun:
         with self.profiler.stage("write"):
             made.write_evaluation()
         self.check_calibration()
-        if self.calibration is not None and self.lens_error is None:
+        if self.calibration is not None and not calibration_pass.can_tell(self.lens_error):
             self._add_notes([UNCHECKED])
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()

@@ -34,7 +34,13 @@ from aquaflow.live.service_frontends import ServiceFrontends
 from aquaflow.live.vehicle.arming import refuse_without_autopilot
 from aquaflow.mapping.work import Progress
 from aquaflow.recordings.playback import Playback
-from aquaflow.sources import open_camera, open_links, open_recording, telemetry_reader
+from aquaflow.sources import (
+    notes_with,
+    open_camera,
+    open_links,
+    open_recording,
+    telemetry_reader,
+)
 from aquaflow.types import CameraModel
 
 log = logging.getLogger(__name__)
@@ -320,4 +326,5 @@ def recording(
     failures = Failures()
     playback = Playback(camera, telemetry, speed, failures=failures)
     known = calibration or camera.camera
-    return PlaybackFeed(playback, vehicle.source, known, camera.name_of, camera.notes, failures)
+    notes = notes_with(camera, known)
+    return PlaybackFeed(playback, vehicle.source, known, camera.name_of, notes, failures)

@@ -186,6 +186,19 @@ def sources_of(camera: object) -> dict[str, str]:
     return camera.sources() if isinstance(camera, StatesSources) else {}
 
 
+GIVEN = "the calibration is the one that was given (--calib)"
+"""Source of a calibration that is not the recording's own."""
+
+
+def notes_with(recording: RecordedCamera, calibration: CameraModel | None) -> list[str]:
+    """The notes of a recording that is mapped with ``calibration``: where that is not its own, what
+    became of its own does not matter."""
+    own = sources_of(recording).get("calibration")
+    if calibration is None or calibration is recording.camera or own is None:
+        return list(recording.notes)
+    return [GIVEN if note == own else note for note in recording.notes]
+
+
 @runtime_checkable
 class FollowsPictures(Protocol):
     """Recorded telemetry whose clock begins with the first picture of its own recording."""

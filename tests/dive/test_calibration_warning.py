@@ -56,6 +56,24 @@ def test_a_given_calibration_that_cannot_be_checked_is_noted_and_no_other_is(
     said = "whether the calibration fits could not be checked"
     assert sum(note.startswith(said) for note in finished.notes) == 1
     assert beside not in finished.notes
+    assert "the calibration is the one that was given (--calib)" in finished.notes
+
+
+@pytest.mark.parametrize("how", [(), ("--realtime",)])
+def test_a_calibration_that_a_short_dive_cannot_judge_is_noted_and_named(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path, how: tuple[str, ...]
+) -> None:
+    recording = open_recording(small_recording)
+    assert recording.camera is not None
+    save_camera(recording.camera.with_focal_scaled(2.0), tmp_path / "twice.yaml")
+    ran = aquaflow(
+        *("map", small_recording, "--calib", tmp_path / "twice.yaml", "--tracking-only", *how),
+        *("--stop", 12, "--out", tmp_path / "dive"),
+    )
+    assert "camera.yaml" not in ran.out
+    if not how:  # what the live loop takes of a recording depends on the machine
+        assert "Note: whether the calibration fits could not be checked" in ran.out
+        assert "Note: the calibration is the one that was given (--calib)." in ran.out
 
 
 def test_the_right_calibration_is_no_warning(small_dive: Path) -> None:
