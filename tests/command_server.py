@@ -24,6 +24,10 @@ IMPORTED = (
 """Slow to import; none of them starts a thread when it is imported, so a fork is whole."""
 
 
+LINE_S = 3600.0
+"""Without a line of progress: what a test maps takes more than a minute on a busy machine."""
+
+
 class Command(TypedDict):
     """What a shell would set before it starts a program."""
 
@@ -64,8 +68,9 @@ def become(command: Command) -> None:
 def run() -> int:
     """The exit status, after all that a process does at its end but taking the interpreter apart:
     that would touch, and so copy, all of the server's memory."""
-    from aquaflow.cli import main
+    from aquaflow.cli import console, main
 
+    console.LINE_S = LINE_S
     status = 0
     try:
         main()

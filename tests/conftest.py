@@ -28,6 +28,7 @@ import pytest
 from hypothesis import settings
 
 from tests.command_line import Cli, Ran, refused, run_aquaflow
+from tests.command_server import LINE_S
 from tests.made_once import made_once
 from tests.small_recording import FRAMES, HEIGHT, QUICK, WIDTH
 
@@ -103,7 +104,9 @@ def command(
     """``command("map", source)`` calls the entry point of ``aquaflow`` in this process: the same
     options and the same net for errors, without the seconds that torch takes to start."""
     from aquaflow import cli
+    from aquaflow.cli import console
 
+    monkeypatch.setattr(console, "LINE_S", LINE_S)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
     def run(*arguments: object) -> Ran:

@@ -48,7 +48,8 @@ def map_recording(
         settings: single settings on top of both, nested as in the YAML file, such as
             ``{"source": {"every": 2}}``.
         overwrite: replace a dive that ``out`` holds already.
-        progress: called with the stage, the steps done and the number of steps (None: unknown).
+        progress: called with the stage, the steps done and the number of steps (None: unknown);
+            the stage ``whole`` counts the seconds of all stages, of which the number is estimated.
         telemetry: logs that were recorded with ``source``, beside the telemetry in it.
         telemetry_offset_s: when these logs begin, s after the first picture; None: it is found
             from the rotations that the logs and the poses have in common.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -115,30 +116,108 @@ LOG_WIDTH = 200
 """Table width without a terminal: a log must neither cut nor fold numbers."""
 
 
+LINE_S = 60.0
+"""Between two lines of progress where there is no terminal."""
+WHOLE = "whole"
+"""Stage that counts the seconds of all others, of which it estimates the number."""
+
+
 @contextmanager
 def progress_bars(quiet: bool) -> Iterator[Any]:
-    """A function (stage, done, total) that draws a bar per stage on a terminal."""
+    """A function (stage, done, total) that draws a bar for each stage on a terminal, and elsewhere,
+    as in the journal of a service, says once a minute how far it is. What is left is that of
+    ``WHOLE`` if the command knows it, else of the stage."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description:>8}"), BarColumn(), MofNCompleteColumn())
-    hidden = quiet or not console.is_terminal
-    with Progress(*columns, TimeRemainingColumn(), console=console, disable=hidden) as bars:
+    course, console = _Course(), Console(stderr=True)
+    if quiet:
+        yield course.advance
+    elif console.is_terminal:
+        with _bars(course, console) as advance:
+            yield advance
+    else:
+        with _lines(course):
+            yield course.advance
+
+
+class _Course:
+    """How far a command is."""
+
+    def __init__(self) -> None:
+        self.stage = ""
+        self._done, self._total = 0, 0
+        self._begun, self._begun_s = 0, 0.0
+        self._ends_s: float | None = None
+        self._knows_whole = False
+
+    def advance(self, stage: str, done: int, total: int | None) -> None:
+        """``done`` of the steps of a stage are done."""
+        now_s = time.monotonic()
+        if stage == WHOLE:
+            self._knows_whole, self._ends_s = True, now_s + (total or done) - done
+            return
+        if stage != self.stage:
+            self.stage, self._begun, self._begun_s = stage, done, now_s
+        self._done, self._total = done, total or 0
+        if not self._knows_whole:
+            paced = self._total > 0 and done > self._begun
+            step_s = (now_s - self._begun_s) / max(done - self._begun, 1)
+            self._ends_s = now_s + step_s * (self._total - done) if paced else None
+
+    def left(self) -> str:
+        """The time left, in words; empty while it is unknown."""
+        if self._ends_s is None:
+            return ""
+        left_s = max(self._ends_s - time.monotonic(), 0.0)
+        hours, minutes = divmod(round(left_s / 60.0), 60)
+        if not hours + minutes:
+            return "less than a minute left"
+        return f"about {f'{hours} h ' if hours else ''}{minutes} min left"
+
+    def in_words(self) -> str:
+        """One line."""
+        of = f" of {self._total}" if self._total else ""
+        return "; ".join(filter(None, [f"{self.stage}: {self._done}{of}", self.left()]))
+
+
+@contextmanager
+def _bars(course: _Course, console: Console) -> Iterator[Any]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    text, left = TextColumn("{task.description:>8}"), TextColumn("{task.fields[left]}")
+    with Progress(text, BarColumn(), MofNCompleteColumn(), left, console=console) as bars:
         tasks: dict[str, Any] = {}
 
         def advance(stage: str, done: int, total: int | None) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+            if stage != WHOLE and course.stage in tasks:
+                bars.update(tasks[course.stage], left="")
+            course.advance(stage, done, total)
+            if stage != WHOLE:
+                if stage not in tasks:
+                    tasks[stage] = bars.add_task(stage, total=total, left="")
+                bars.update(tasks[stage], completed=done, total=total)
+            if course.stage in tasks:
+                bars.update(tasks[course.stage], left=course.left())
 
         yield advance
+
+
+@contextmanager
+def _lines(course: _Course) -> Iterator[None]:
+    ended = threading.Event()
+
+    def tell() -> None:
+        while not ended.wait(LINE_S):
+            if course.stage:
+                typer.echo(course.in_words(), err=True)
+
+    teller = threading.Thread(target=tell, daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        teller.join()
 
 
 def unit_in_words(metrics: Mapping[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from aquaflow.config.stage import MountingConfig
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
+from aquaflow.mapping.work import MIN_VIEWS
 from aquaflow.recordings.playback import Event, Playback, read_past_failures
 from aquaflow.slam import Slam
 from aquaflow.sources import GIVEN, RecordedCamera, mounting_of, notes_with, sources_of
@@ -33,7 +35,8 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import CameraModel, Dropped, Frame
 
 Progress = Callable[[str, int, int | None], None]
-"""Called with the stage, the steps done and, where known, the steps there are."""
+"""Called with the stage, the steps done and, where known, the steps there are. The stage ``whole``
+counts seconds, those that all stages together take as far as can be told."""
 
 
 TORCH_PRIORS = ("xfeat", "aliked")
@@ -110,7 +113,7 @@ def _replay(
     run: DiveRun, recording: RecordedCamera, telemetry: TelemetryInput, playback: Playback,
     config: Config, progress: Progress,
 ) -> Finished:  # fmt: skip
-    source, count = config.source, recording.frame_count
+    source, count, left = config.source, recording.frame_count, TimeLeft(run, progress)
     stop = count if source.stop is None else min(source.stop, count or source.stop)
     total = None if stop is None else len(range(source.start, stop, source.every))
     done = 0
@@ -127,6 +130,7 @@ def _replay(
                 run.look()
         with run.slam.stages("progress"):
             progress("map", done, total)
+            left.mapped(done, total)
     if done == 0:
         end = "the end" if source.stop is None else f"--stop {source.stop}"
         known = "" if count is None else f" of its {count} frames"
@@ -136,7 +140,58 @@ def _replay(
     synchronise(run, telemetry)
     run.sources = _sources(run, recording)
     notes = notes_with(recording, run.calibration) + telemetry.notes
-    return run.finish(notes, lambda done, total: progress("refine", done, total))
+
+    def refined(done: int, total: int) -> None:
+        progress("refine", done, total)
+        left.refined()
+
+    return run.finish(notes, refined)
+
+
+REFINING_COST = 1.5
+"""Of a refining step, in steps while frames come, of smaller maps; 1.2 to 2.5 in six dives."""
+ENDING_STEPS = 250
+"""Refining steps in whose time a dive is judged, measured and written; 110 to 380 in six dives."""
+
+
+class TimeLeft:
+    """Tells ``progress`` how long a replay takes in all, by its pace so far."""
+
+    def __init__(self, run: DiveRun, progress: Progress) -> None:
+        self._run, self._progress = run, progress
+        self._begun_s = self._refining_s = time.monotonic()
+        self._refined = 0
+
+    def mapped(self, done: int, total: int | None) -> None:
+        """``done`` of the frames are tracked and mapped."""
+        steps = sum(mapper.steps for mapper in self._run.slam.mappers.values())
+        if total is None or (self._run.config.mapping.enabled and not steps):
+            return
+        optimising_s = 1e-3 * self._run.profiler.totals_ms().get("optimise", 0.0)
+        mapping_s = (time.monotonic() - self._begun_s) / done * (total - done)
+        self._tell(mapping_s + self._ending_s(REFINING_COST * optimising_s / max(steps, 1)))
+
+    def refined(self) -> None:
+        """Another step of refining is done."""
+        if self._refined == 0:
+            self._refining_s = time.monotonic()
+        else:
+            step_s = (time.monotonic() - self._refining_s) / self._refined
+            self._tell(self._ending_s(step_s))
+        self._refined += 1
+
+    def _ending_s(self, step_s: float) -> float:
+        """What is left after the last frame, where a step of refining takes so long."""
+        optimiser = self._run.config.mapping.optimiser
+        maps = sum(len(each.views) >= MIN_VIEWS for each in self._run.slam.mappers.values())
+        left_s = step_s * max(maps * optimiser.refine_steps - self._refined, 0)
+        if optimiser.refine_seconds is not None:
+            left_s = min(left_s, max(optimiser.refine_seconds - step_s * self._refined, 0.0))
+        return left_s + step_s * ENDING_STEPS
+
+    def _tell(self, left_s: float) -> None:
+        so_far_s = time.monotonic() - self._run.started
+        self._progress("whole", round(so_far_s), round(so_far_s + left_s))
 
 
 def _sources(run: DiveRun, recording: RecordedCamera) -> dict[str, str]:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from aquaflow import __version__
-from aquaflow.cli import COMMANDS, HELP, OLD_NAMES
+from aquaflow.cli import COMMANDS, HELP, OLD_NAMES, console
 from aquaflow.config import Config, load_config
 from tests.command_line import Cli, refused
 from tests.small_recording import FRAMES, HASTY
@@ -71,6 +71,19 @@ def test_a_folder_with_the_name_of_a_command_is_given_by_its_path(
     (tmp_path / "video").mkdir()
     refused(aquaflow("export", tmp_path / "video", "--format", "spz"), "video")
     assert aquaflow("export", "video", "--format", "spz").code == 2
+
+
+def test_without_a_terminal_lines_say_how_far_a_dive_is_and_what_is_left_of_all(
+    command: Cli, small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "LINE_S", 0.01)
+    ran = command("map", small_recording, *HASTY, "--out", tmp_path / "dive")
+    assert ran.code == 0
+    said = [line for line in ran.err.splitlines() if line.startswith(("map: ", "refine: "))]
+    assert {line.partition(":")[0] for line in said} == {"map", "refine"}
+    form = r"(map|refine): \d+ of \d+(; (about (\d+ h )?\d+ min|less than a minute) left)?"
+    assert all(re.fullmatch(form, line) for line in said)
+    assert said[-1].endswith(" left")
 
 
 def test_config_prints_yaml_that_loads_back(aquaflow: Cli, tmp_path: Path) -> None:

@@ -126,6 +126,9 @@ def test_progress_reaches_the_number_of_frames(small_recording: Path, tmp_path: 
         progress=lambda *step: seen.append(step),
     )
     assert [step for step in seen if step[0] == "map"][-1] == ("map", FRAMES, FRAMES)
+    whole = [(done_s, all_s) for stage, done_s, all_s in seen if stage == "whole"]
+    assert len(whole) == FRAMES
+    assert all(all_s is not None and done_s <= all_s for done_s, all_s in whole)
 
 
 def test_a_still_camera_gives_no_map_and_says_what_is_needed(
