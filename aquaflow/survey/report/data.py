@@ -113,6 +113,8 @@ class MediumCurves:
     """L* of the same ground, far over near: as the camera saw it, and restored."""
     lamp: Lamp | None = None
     """Light from beside the camera; None where none was found."""
+    beta_sigma: Rgb | None = None
+    """Relative 1 sigma of beta; None where the ranges that were seen allowed no fit."""
 
 
 @dataclass(frozen=True)

@@ -97,24 +97,27 @@ def _medium(dive: Dive) -> MediumCurves | None:
         return None
     try:
         scattered = content["backscatter"]
-        beta, b, B_inf, B_res, d = (
-            (float(r), float(g), float(blue))
-            for r, g, blue in (
-                content["attenuation_per_unit"], scattered["b"], scattered["B_inf"],
-                scattered["B_res"], scattered["d"],
-            )
-        )  # fmt: skip
+        beta = _rgb(content["attenuation_per_unit"])
+        b, B_inf, B_res, d = (_rgb(scattered[name]) for name in ("b", "B_inf", "B_res", "d"))
         span = float(content["range_p5"]), float(content["range_p95"])
         white = _white(content.get("restored"))
         light = content.get("lightness_over_range")
         lamp = lamp_of(content)
         lightness = None if light is None else (float(light["seen"]), float(light["restored"]))
+        sigma = content.get("attenuation_relative_sigma")
+        beta_sigma = None if sigma is None else _rgb(sigma)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{dive.file(MEDIUM)} is damaged; map the dive again") from error
     return MediumCurves(
         beta, b, B_inf, B_res, d, *span,
         unit=dive.frame.unit, white=white, lightness=lightness, lamp=lamp,
+        beta_sigma=beta_sigma,
     )  # fmt: skip
+
+
+def _rgb(channels: Any) -> Rgb:
+    red, green, blue = (float(channel) for channel in channels)
+    return red, green, blue
 
 
 def _white(restored: Any) -> tuple[str, Rgb, Rgb] | None:
@@ -123,11 +126,7 @@ def _white(restored: Any) -> tuple[str, Rgb, Rgb] | None:
     said = restored.get("white_balance") if isinstance(restored, dict) else None
     if not isinstance(said, dict) or said["sigma"] is None:
         return None
-    gain, sigma = (
-        (float(red), float(green), float(blue))
-        for red, green, blue in (said["gain"], said["sigma"])
-    )
-    return str(said["choice"]), gain, sigma
+    return str(said["choice"]), _rgb(said["gain"]), _rgb(said["sigma"])
 
 
 def _reef(dive: Dive) -> list[ReefRow]:

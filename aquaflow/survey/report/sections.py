@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config import MediumConfig
 from aquaflow.survey.coverage.classes import WORDS, CoverageClass
 from aquaflow.survey.coverage.footprint import visibility
 from aquaflow.survey.coverage.page_view import PageView
@@ -389,16 +390,23 @@ RGB = ("red", "green", "blue")
 def water_rows(data: MediumCurves) -> Rows:
     """Name and one value for each channel."""
     per = "1/m" if data.unit == "m" else "1/map unit"
-    named = (
-        (f"attenuation of the scene's light, {per}", data.beta, "{:.3f}"),
-        (f"backscatter coefficient, {per}", data.b, "{:.3f}"),
-        ("backscatter of endless water, share", data.B_inf, "{:.3f}"),
-        (f"decay of near backscatter, {per}", data.d, "{:.3f}"),
-        ("near backscatter, share", data.B_res, "{:.3f}"),
-    )
-    rows: Rows = [(name, *(form.format(value) for value in values)) for name, values, form in named]
-    halves = [f"{np.log(2.0) / value:.2f}" if value > 0.0 else "" for value in data.beta]
-    rows.append((f"half of the light is lost over, {data.unit}", *halves))
+    sigmas = data.beta_sigma or (None, None, None)
+    halves = [np.log(2.0) / value if value > 0.0 else None for value in data.beta]
+    rows: Rows = [
+        (f"attenuation of the scene's light, {per}", *map(_with_sigma, data.beta, sigmas)),
+        (f"half of the light is lost over, {data.unit}", *map(_with_sigma, halves, sigmas)),
+        (f"backscatter coefficient, {per}", *map(_with_sigma, data.b)),
+        ("backscatter of endless water, share", *map(_with_sigma, data.B_inf)),
+    ]
+    start = MediumConfig().initial_B_res
+    learned = [abs(value / start - 1.0) > UNMOVED for value in data.B_res]
+    if any(learned):
+        for name, values in (
+            ("near backscatter, share", data.B_res),
+            (f"decay of near backscatter, {per}", data.d),
+        ):
+            known = zip(values, learned, strict=True)
+            rows.append((name, *(_with_sigma(each) if at else "" for each, at in known)))
     if data.white is not None:
         name, *numbers = data.white
         gains = [
@@ -408,15 +416,39 @@ def water_rows(data: MediumCurves) -> Rows:
     return rows
 
 
+UNMOVED = 0.01
+"""Change of the near backscatter from its start up to which neither it nor its decay was learned:
+0.001 on two reefs."""
+
+
+def _with_sigma(value: float | None, relative_sigma: float | None = None) -> str:
+    """Empty where there is none."""
+    if value is None:
+        return ""
+    return f"{value:.3f}" + (
+        "" if relative_sigma is None else f" \u00b1 {value * relative_sigma:.3f}"
+    )
+
+
 def visibility_words(data: MediumCurves) -> str:
-    """Visibility, in a sentence."""
+    """Visibility, and how sure the attenuation is, in sentences."""
     found = visibility(data.beta)
     if found is None:
         return "Visibility is not limited by the water that was found."
     looked = f"{data.range_p5:.2g} to {data.range_p95:.2g} {data.unit}"
-    said = f"Visibility: {found:.2g} {data.unit}; this dive looked {looked} far."
+    sure = (
+        " How sure the attenuation is, is not known: the ranges that were seen allowed no fit."
+        if data.beta_sigma is None
+        else f" \u00b1 is 1 sigma; that of the visibility is {_sigma_of_clearest(data):.0%}."
+    )
+    said = f"Visibility: {found:.2g} {data.unit}; this dive looked {looked} far.{sure}"
     beyond = " It is extrapolated from what was looked at." if found > 2.0 * data.range_p95 else ""
     return html.escape(said + beyond)
+
+
+def _sigma_of_clearest(data: MediumCurves) -> float:
+    """Relative 1 sigma of the smallest attenuation."""
+    return min(zip(data.beta, data.beta_sigma or (), strict=True))[1]
 
 
 def lightness_words(data: MediumCurves) -> str:

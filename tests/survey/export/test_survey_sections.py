@@ -36,7 +36,7 @@ from tests.survey.coverage.surveys import lawnmower, metric, survey_of
 VIEW = survey_of(lawnmower(3, 6.0, 1.0, 0.45))
 WATER = MediumCurves(
     (0.6, 0.2, 0.3), (0.5, 0.3, 0.3), (0.05, 0.3, 0.4), (0.0, 0.01, 0.01), (0.4, 0.4, 0.4),
-    1.0, 4.0, "m",
+    1.0, 4.0, "m", beta_sigma=(0.1, 0.2, 0.54),
 )  # fmt: skip
 TIMES = np.linspace(0.0, 600.0, 50)
 
@@ -111,9 +111,13 @@ def test_shares_of_the_classes_are_of_what_was_seen() -> None:
 
 def test_the_water_is_in_numbers_of_a_unit_that_is_said() -> None:
     rows = {name: values for name, *values in survey_sections.water_rows(WATER)}
-    assert rows["attenuation of the scene's light, 1/m"] == ["0.600", "0.200", "0.300"]
-    assert rows["half of the light is lost over, m"][1] == "3.47"
+    attenuation = ["0.600 \u00b1 0.060", "0.200 \u00b1 0.040", "0.300 \u00b1 0.162"]
+    assert rows["attenuation of the scene's light, 1/m"] == attenuation
+    assert rows["half of the light is lost over, m"][1] == "3.466 \u00b1 0.693"
     assert "Visibility: 15 m" in survey_sections.visibility_words(WATER)
+    assert "that of the visibility is 20%" in survey_sections.visibility_words(WATER)
+    unsure = survey_sections.visibility_words(replace(WATER, beta_sigma=None))
+    assert "How sure the attenuation is, is not known" in unsure
     assert "extrapolated" in survey_sections.visibility_words(WATER)
     assert survey_sections.lightness_words(WATER) == ""
     far = replace(WATER, lightness=(0.834, 1.012))
@@ -123,6 +127,14 @@ def test_the_water_is_in_numbers_of_a_unit_that_is_said() -> None:
     assert "attenuation of the scene's light, 1/map unit" in {
         row[0] for row in survey_sections.water_rows(in_units)
     }
+
+
+def test_what_is_still_as_it_started_is_no_finding() -> None:
+    rows = {name: values for name, *values in survey_sections.water_rows(WATER)}
+    assert rows["near backscatter, share"] == ["0.000", "", ""]
+    assert rows["decay of near backscatter, 1/m"] == ["0.400", "", ""]
+    unmoved = replace(WATER, B_res=(0.00999, 0.01, 0.01))
+    assert not [row[0] for row in survey_sections.water_rows(unmoved) if "near" in row[0]]
 
 
 def test_a_chosen_white_balance_is_reported_with_its_certainty() -> None:

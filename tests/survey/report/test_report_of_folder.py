@@ -46,6 +46,18 @@ def test_the_folder_gives_back_what_the_report_showed(small_dive: Path) -> None:
     assert all(note.split("&")[0] in page for note in data.notes if "'" not in note)
 
 
+def test_the_waters_attenuation_has_its_sigma_and_start_values_are_no_findings(
+    small_dive: Path,
+) -> None:
+    page = html.unescape((small_dive / "report.html").read_text())
+    water = json.loads((small_dive / "medium.json").read_text())
+    pairs = zip(water["attenuation_per_unit"], water["attenuation_relative_sigma"], strict=True)
+    for value, sigma in pairs:
+        assert f"{value:.3f} \u00b1 {value * sigma:.3f}" in page
+    moved = [abs(share / 0.01 - 1.0) > 0.01 for share in water["backscatter"]["B_res"]]
+    assert ("near backscatter" in page) == any(moved)
+
+
 def test_the_ground_in_numbers_is_that_of_the_page_until_its_unit_changes(dive: Path) -> None:
     page, rows = (dive / "report.html").read_text(), report_of(Dive(dive)).reef
     assert len(rows) > 5
