@@ -61,7 +61,7 @@ def write_map(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """One map of the merged dives: of every place the dive that shows it last, or much closer."""
+    """One map of the merged dives: of each place the dive that shows it last, or more finely."""
     from aquaflow.survey.change.site_map import make_site_map
 
     with progress_bars(quiet=as_json) as progress, tempfile.TemporaryDirectory() as work:

@@ -1,11 +1,11 @@
-"""One map of a site: of every place the dive that shows it last, or much closer than the last.
+"""One map of a site: of every place the dive that shows it last, or more finely than the last.
 
 Each dive's map stays what it is; the Gaussians of all are taken together, and where several dives
 show a place, one of them counts:
 
 - What a later dive's views see past is gone.
-- Of dives that show a surface there the latest counts, unless an earlier one shows it from so much
-  nearer that its pixels are less than half as wide: a look from afar does not replace a close one.
+- Of dives that show a surface there the latest counts, unless an earlier one shows it in finer
+  pixels: a look from afar, or in small pictures, does not replace a close one.
 - Where no other dive looked, a dive's Gaussians stay.
 
 Colours are without water, and every dive has its own light: those of earlier dives are multiplied
@@ -41,8 +41,9 @@ MARGIN_RESOLUTIONS = 6.0
 """Distance across a surface up to which two dives show the same one, in resolutions of the coarser
 map: 0.15 m where a picture shows 1.9 m. Dives of a merged site lie within some centimetres of each
 other, and no finer than that is a thing gone, or new."""
-MUCH_CLOSER = 2.0
-"""Ratio of the pixels' width on the ground from which an earlier dive counts before a later."""
+FINER = 1.25
+"""Ratio of the pixels' width on the ground from which an earlier dive counts before a later: more
+than dives of one altitude and camera differ by, less than pictures of 320 and 480 px do."""
 BLOCK_RANGES = 2.0
 """Side of the blocks that are looked at together, in median ranges of the views."""
 OPAQUE = 0.5
@@ -75,7 +76,7 @@ class Part:
     gone: int
     """Gaussians that later dives see past."""
     replaced: int
-    """Gaussians of places that another dive shows later, or from much nearer."""
+    """Gaussians of places that another dive shows later, or more finely."""
     gains: tuple[float, float, float]
     """That its colours were multiplied by."""
 
@@ -108,9 +109,9 @@ def _overrule(days: Sequence[DayMap], number: int) -> tuple[Mask, Mask]:
             seen = _look(other, places[block], max(day.resolution, other.resolution))
             if other_number > number:
                 gone[block] |= seen.seen_past
-                replaced[block] |= seen.shown & (seen.footprint < MUCH_CLOSER * own.footprint)
+                replaced[block] |= seen.shown & (seen.footprint < FINER * own.footprint)
             else:
-                replaced[block] |= seen.shown & (MUCH_CLOSER * seen.footprint <= own.footprint)
+                replaced[block] |= seen.shown & (FINER * seen.footprint <= own.footprint)
     return gone, replaced
 
 

@@ -32,7 +32,7 @@ class SiteMapPart:
     gone: int
     """Number of Gaussians that later dives see past."""
     replaced: int
-    """Number of Gaussians of places that another dive shows later, or from much nearer."""
+    """Number of Gaussians of places that another dive shows later, or in finer pixels."""
     gains: list[float]
     """[3] factors of the dive's colours."""
 

@@ -110,6 +110,18 @@ def test_a_look_from_afar_replaces_no_close_one_whichever_is_later(work: Path) -
         assert not seen(parts["far"]).any()
 
 
+def test_small_pictures_replace_no_sharper_ones_and_as_sharp_ones_do(work: Path) -> None:
+    sharp = DayMap("sharp", gaussians(None), sharp_views(None, work))
+    small = DayMap("small", gaussians(None), views_of(None, work, SHARP.resize(320, 240)))
+    before, after = combine([sharp, small])
+    assert seen(before.gaussians).sum() == seen(sharp.gaussians).sum()
+    assert not seen(after.gaussians).any()
+    higher = DayMap("higher", gaussians(None), from_afar(work, 2.2))
+    before, after = combine([sharp, higher])
+    assert not seen(before.gaussians).any()
+    assert seen(after.gaussians).sum() == seen(higher.gaussians).sum()
+
+
 def test_a_look_from_afar_sees_what_is_gone(work: Path) -> None:
     mast = gaussians(None)
     at_mast = np.hypot(*mast.means[:, :2].T) < 0.05
