@@ -165,6 +165,11 @@ def test_every_file_that_a_page_links_to_exists(page: Path) -> None:
     assert [target for target in local if not (page.parent / target).exists()] == []
 
 
+def test_every_page_is_reached_from_the_first_one() -> None:
+    linked = {link.partition("#")[0] for link in LINK.findall((DOCS / "index.md").read_text())}
+    assert {page.name for page in DOCS.glob("*.md")} - linked == {"index.md"}
+
+
 def test_every_page_and_anchor_that_code_and_pages_refer_to_exists() -> None:
     missing = []
     suffixes = (".py", ".h", ".cpp", ".yaml", ".sh", ".md")

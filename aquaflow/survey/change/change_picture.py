@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ from aquaflow.survey.export.ortho.geotiff import writing_raster
 from aquaflow.survey.export.ortho.grid import NODATA, Grid, RasterFile
 from aquaflow.survey.export.ortho.ground import Ground
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Array = npt.NDArray[np.float64]
 
 WIDTH_IN, DOTS_PER_INCH = 16.0, 110
@@ -34,6 +37,8 @@ COLOURS = {
     BLEACHED: "#ffd92f", MOVED_AWAY: "#e7298a", MOVED_HERE: "#7570b3",
 }  # fmt: skip
 """Of the classes: ColorBrewer's Dark2, which most colour-blind people tell apart."""
+WORDS = {NOT_SEEN: "seen on one day alone", UNCHANGED: "unchanged", **NAMES}
+"""Of the classes, in the legend."""
 SHOWN_PERCENTILE = 99.0
 """Of brightness, which is white in the pictures of the days."""
 SHOWN_LEVELS = 3.0
@@ -44,8 +49,19 @@ def change_png(
     compared: SurfaceComparison, patches: list[Patch], first: Surface, second: Surface, unit: str
 ) -> bytes:
     """A PNG file."""
+    figure = change_figure(compared, patches, first, second, unit)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": "AquaFlow"})
+    return buffer.getvalue()
+
+
+def change_figure(
+    compared: SurfaceComparison, patches: list[Patch], first: Surface, second: Surface, unit: str
+) -> Figure:
+    """Both days, distances and classes side by side, from above, with what the colours mean."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     grid = grid_of(compared)
     bands = np.where(bands_of(compared, grid) == NODATA, np.nan, bands_of(compared, grid))
@@ -72,9 +88,9 @@ def change_png(
         each.set_title(title)
         each.set_aspect("equal")
     _label(axes[3], patches)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": "AquaFlow"})
-    return buffer.getvalue()
+    there = [Patch(color=COLOURS[kind], label=WORDS[kind]) for kind in kinds if kind in bands[2]]
+    figure.legend(handles=there, loc="outside lower right", ncols=len(there), frameon=False)
+    return figure
 
 
 def _label(axes: Any, patches: list[Patch]) -> None:

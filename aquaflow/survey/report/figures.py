@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,17 +27,20 @@ SUB_MAP_COLOURS = ("#1098ad", "#f08c00", "#7048e8", "#d6336c", "#66a80f", "#868e
 TRUTH_COLOUR = "#e8505b"
 """Distinct on light and on dark paper; with more sub-maps the colours come again."""
 
+TEXT_PT, TITLE_PT = 10.0, 11.0
+"""Letters of labels and legends, and of titles."""
+
 STYLE: Any = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
-    "font.size": 10.0,
+    "font.size": TEXT_PT,
     "text.color": INK,
     "axes.labelcolor": INK,
     "axes.edgecolor": GRID,
     "axes.grid": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.titlesize": 11.0,
+    "axes.titlesize": TITLE_PT,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "grid.color": GRID,
@@ -45,12 +49,18 @@ STYLE: Any = {
     "ytick.color": INK,
     "xtick.major.size": 0.0,
     "ytick.major.size": 0.0,
+    "xtick.major.pad": 6.0,
     "legend.frameon": False,
 }
 """Matplotlib's settings; text stays text, so that the page's font is used."""
 
 CURVE_SAMPLES = 128
 """Points of each drawn curve."""
+
+SIDES_IN = 0.6
+"""Beside a panel: what its vertical axis takes."""
+LEGEND_MARK_IN = 0.65
+"""Before each text of a legend, with the space to the next one, at 10 pt."""
 
 
 def path_svg(path: PathPlot) -> str:
@@ -80,6 +90,53 @@ def draw(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
     return figure
 
 
+def text_width_in(text: str, size_pt: float, weight: str = "normal") -> float:
+    """Inches that a line takes in the figures' font."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(size=size_pt, weight=weight)
+    return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0]) / 72.0
+
+
+def fold(text: str, width_in: float, size_pt: float, weight: str = "normal") -> list[str]:
+    """Lines of ``text`` that are no wider, one at least; words that are wider are cut."""
+    lines, line = [], ""
+    for word in text.split():
+        longer = f"{line} {word}" if line else word
+        if text_width_in(longer, size_pt, weight) <= width_in:
+            line = longer
+            continue
+        if line:
+            lines.append(line)
+        line = word
+        while len(line) > 1 and text_width_in(line, size_pt, weight) > width_in:
+            fits = len(line) - 1
+            while fits > 1 and text_width_in(line[:fits], size_pt, weight) > width_in:
+                fits -= 1
+            lines.append(line[:fits])
+            line = line[fits:]
+    return [*lines, line]
+
+
+def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
+    """Below all axes, in as many columns as the figure is wide enough for."""
+    widest = max(text_width_in(handle.get_label(), TEXT_PT) for handle in handles)
+    fits = int(_width_in(figure) // (widest + LEGEND_MARK_IN))
+    columns = min(max(fits, 1), len(handles))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+
+
+def _folded_title(figure: Figure, text: str, panels: int = 1) -> str:
+    """Of one of so many panels side by side."""
+    room = _width_in(figure) / panels - SIDES_IN
+    return "\n".join(fold(text, room, TITLE_PT, "bold"))
+
+
+def _width_in(figure: Figure) -> float:
+    return float(figure.bbox.width / figure.dpi)
+
+
 def level_axes(figure: Figure, path: PathPlot) -> None:
     """Draw a path from above, x up, and from the side with its depth, into an empty figure."""
     finite = np.isfinite(path.positions).all(axis=1)
@@ -92,15 +149,14 @@ def level_axes(figure: Figure, path: PathPlot) -> None:
     for axes, (u, v) in ((above, (0, 1)), (side, (2, 3))):
         _draw_view(axes, ours, truth, path, u, v)
         axes.set_aspect("equal", adjustable="datalim")
-    above.set_title(f"From above, {path.up} up")
+    above.set_title(_folded_title(figure, f"From above, {path.up} up", 2))
     above.set_xlabel(f"{'east' if path.up == 'true north' else 'to the right'}, {path.unit}")
     above.set_ylabel(f"{path.up}, {path.unit}")
     side.set_title("From the side")
     side.set_xlabel(f"along the path's longest direction, {path.unit}")
     side.set_ylabel(f"{'depth' if path.depth_known else 'down'}, {path.unit}")
     side.invert_yaxis()
-    handles, labels = above.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    add_legend(figure, above.get_legend_handles_labels()[0])
 
 
 def path_axes(figure: Figure, path: PathPlot) -> None:
@@ -118,8 +174,7 @@ def path_axes(figure: Figure, path: PathPlot) -> None:
         axes.set_xlabel(path.unit)
         axes.set_ylabel(path.unit)
         axes.set_aspect("equal", adjustable="datalim")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    add_legend(figure, panels[0].get_legend_handles_labels()[0])
 
 
 def _draw_view(
@@ -172,8 +227,7 @@ def medium_axes(figure: Figure, medium: MediumCurves) -> None:
         axes.axvspan(medium.range_p5, medium.range_p95, color=GRID, alpha=0.35, lw=0.0)
         axes.set_xlim(0.0, z[-1])
         axes.set_xlabel(f"distance from the camera ({medium.unit})")
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    add_legend(figure, left.get_legend_handles_labels()[0])
 
 
 def svg_of(figure: Figure, salt: str) -> str:
@@ -240,7 +294,8 @@ def coverage_axes(figure: Figure, view: PageView) -> None:
     axes.set_xlim(low[0] - room, high[0] + room)
     axes.set_ylim(low[1] - room, high[1] + room)
     axes.set_aspect("equal", adjustable="box")
-    axes.set_title(f"Seen {view.seen}, up: {view.up}")
+    title = _folded_title(figure, f"Seen {view.seen}, up: {view.up}")
+    figure.suptitle(title, fontsize=TITLE_PT, weight="bold")
     axes.set_xlabel(f"{view.right}, {view.unit}")
     axes.set_ylabel(f"{view.up}, {view.unit}")
     patches = [
@@ -248,7 +303,7 @@ def coverage_axes(figure: Figure, view: PageView) -> None:
         for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR)
     ]
     handles, _ = axes.get_legend_handles_labels()
-    figure.legend(handles=[*patches, *handles], loc="outside lower center", ncols=3)
+    add_legend(figure, [*patches, *handles])
 
 
 def _lines(axes: Axes, view: PageView) -> None:
@@ -275,7 +330,7 @@ def profile_axes(figure: Figure, profile: DepthProfile) -> None:
     panels = figure.subplots(1, len(known), squeeze=False)[0]
     for axes, (values, name, down), colour in zip(panels, known, SUB_MAP_COLOURS, strict=False):
         axes.plot(time, values, color=colour, lw=1.8)
-        axes.set_title(name.capitalize())
+        axes.set_title(_folded_title(figure, name.capitalize(), len(known)))
         axes.set_xlabel(f"time, {unit}")
         axes.set_ylabel(profile.unit)
         if down:

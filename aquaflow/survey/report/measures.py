@@ -29,8 +29,9 @@ def reef(rows: Sequence[ReefRow]) -> str:
     if not rows:
         return ""
     cells = "".join(
-        f"<tr><td>{html.escape(row.label)}</td><td>{html.escape(row.value)}</td>"
-        f"<td>{html.escape(row.interval)}</td><td>{html.escape(row.meaning)}</td></tr>"
+        f'<tr><td>{html.escape(row.label)}</td><td class="value">{html.escape(row.value)}</td>'
+        f'<td class="value">{html.escape(row.interval)}</td>'
+        f"<td>{html.escape(row.meaning)}</td></tr>"
         for row in rows
     )
     return (

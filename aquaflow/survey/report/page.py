@@ -101,7 +101,7 @@ h2 { font-size: 1.2rem; margin: 0 0 .2rem; }
 .brand { color: var(--accent); font-weight: 600; margin: 0 0 .6rem; }
 .lead { font-size: 1.1rem; color: var(--soft); margin: 0 0 1.6rem; max-width: 46rem; }
 section { background: var(--card); border: 1px solid var(--grid); border-radius: 12px;
-  padding: 1.3rem 1.4rem 1.4rem; margin: 0 0 1.2rem; }
+  padding: 1.3rem 1.4rem 1.4rem; margin: 0 0 1.2rem; overflow-x: auto; }
 section > p { color: var(--soft); margin: 0 0 1rem; max-width: 46rem; }
 section > p.after { margin: .8rem 0 0; }
 svg { width: 100%; height: auto; display: block; font-family: inherit; }
@@ -121,6 +121,7 @@ svg { width: 100%; height: auto; display: block; font-family: inherit; }
 @media (min-width: 34rem) {
   .of2, .of4 { grid-template-columns: 1fr 1fr; }
   .of3 { grid-template-columns: 1fr 1fr 1fr; }
+  .value { white-space: nowrap; }
 }
 figure { margin: 0; }
 figcaption { font-size: .84rem; color: var(--soft); margin-top: .25rem; }
@@ -131,7 +132,8 @@ figcaption { font-size: .84rem; color: var(--soft); margin-top: .25rem; }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 th { text-align: left; color: var(--soft); font-weight: 600; }
 td, th { padding: .34rem .7rem .34rem 0; border-bottom: 1px solid var(--grid);
-  vertical-align: top; overflow-wrap: anywhere; }
+  vertical-align: top; }
+td:last-child { overflow-wrap: anywhere; }
 tr:last-child td { border-bottom: 0; }
 .n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .bar { width: 34%; }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-import textwrap
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,12 @@ from aquaflow.survey.report.figures import (
     GRID,
     STYLE,
     coverage_axes,
+    fold,
     level_axes,
     medium_axes,
     path_axes,
     profile_axes,
+    text_width_in,
 )
 from aquaflow.survey.report.sections import MINIMUM_PATH, TILES
 
@@ -29,8 +32,10 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure, SubFigure
 
-EXAMPLE_IN, PATH_IN, PLAN_IN, OVERVIEW_IN, PROFILE_IN, WATER_IN = 2.4, 3.2, 3.8, 3.4, 2.2, 2.8
-"""Heights of the drawings."""
+PATH_IN, PLAN_IN, OVERVIEW_IN, PROFILE_IN, WATER_IN = 3.2, 3.8, 3.4, 2.2, 2.8
+"""Heights of the drawings; that of the map from above at most."""
+GAP_IN, NAME_IN = 0.1, 0.25
+"""Between the pictures of a view, and above each for its name."""
 
 
 def write_pdf(path: Path, data: ReportData) -> int:
@@ -43,17 +48,25 @@ def write_pdf(path: Path, data: ReportData) -> int:
     from matplotlib.backends.backend_pdf import PdfPages
 
     buffer = io.BytesIO()
-    title = f"{data.name}: AquaFlow dive report"
-    known = {"Title": title, "Creator": "AquaFlow", "Producer": None, "CreationDate": None}
+    known = {"Title": _title(data), "Creator": "AquaFlow", "Producer": None, "CreationDate": None}
     with mpl.rc_context({**STYLE, "pdf.fonttype": 42}), PdfPages(buffer, metadata=known) as pdf:
-        pages = Pages(pdf, title)
-        for write in (_summary, _survey, _water, _examples, _words):
-            write(pages, data)
-        pages.close()
+        write_pages(pdf, data)
         count = int(pdf.get_pagecount())
     with atomic_write(path) as stream:
         stream.write(buffer.getvalue())
     return count
+
+
+def write_pages(pdf: PdfPages, data: ReportData) -> None:
+    """Write the report's pages into an open PDF."""
+    pages = Pages(pdf, _title(data))
+    for write in (_summary, _survey, _water, _examples, _words):
+        write(pages, data)
+    pages.close()
+
+
+def _title(data: ReportData) -> str:
+    return f"{data.name}: AquaFlow dive report"
 
 
 def _summary(pages: Pages, data: ReportData) -> None:
@@ -69,7 +82,7 @@ def _summary(pages: Pages, data: ReportData) -> None:
     ])  # fmt: skip
     path = data.path
     if path is not None and np.isfinite(path.positions).all(axis=1).sum() >= MINIMUM_PATH:
-        pages.heading("The path", PATH_IN)
+        pages.heading("The path")
         pages.drawing(PATH_IN, level_axes if path.up else path_axes, path)
     if data.measures is not None:
         pages.heading("Metres, gravity and north")
@@ -80,19 +93,18 @@ def _survey(pages: Pages, data: ReportData) -> None:
     """Coverage, the map from above, and depth over time."""
     view = data.coverage
     if view is not None:
-        pages.heading("What was seen", PLAN_IN + 0.5)
-        pages.paragraph(sections.coverage_words(view))
+        pages.heading("What was seen", sections.coverage_words(view))
         pages.drawing(PLAN_IN, coverage_axes, view)
         pages.table(sections.coverage_rows(view))
     if data.overview is not None:
-        pages.heading("The map from above, without water", OVERVIEW_IN)
+        pages.heading("The map from above, without water")
         pages.picture(_decode(data.overview), OVERVIEW_IN)
     if data.profile is not None:
-        pages.heading("Depth and altitude", PROFILE_IN)
+        pages.heading("Depth and altitude")
         pages.drawing(PROFILE_IN, profile_axes, data.profile)
     if data.reef:
-        pages.heading("The ground in numbers, each with 1 sigma and its 95 % interval")
-        pages.paragraph(f"Vertical: {data.vertical}.")
+        said = f"Each with 1 sigma and its 95 % interval. Vertical: {data.vertical}."
+        pages.heading("The ground in numbers", said)
         pages.table([
             (row.label, row.value, f"({row.interval})" if row.interval else row.meaning)
             for row in data.reef
@@ -103,19 +115,19 @@ def _water(pages: Pages, data: ReportData) -> None:
     """Curves, then numbers."""
     if data.medium is None:
         return
-    pages.heading("The water", WATER_IN)
+    pages.heading("The water")
     pages.drawing(WATER_IN, medium_axes, data.medium)
-    rows = [("", *sections.RGB), *sections.water_rows(data.medium)]
-    pages.table(rows)
+    pages.table([("", *sections.RGB), *sections.water_rows(data.medium)])
     pages.paragraph(sections.visibility_words(data.medium) + sections.lamp_words(data.medium))
 
 
 def _examples(pages: Pages, data: ReportData) -> None:
     """Held-out views."""
     if data.examples:
-        pages.heading("Views that the map never saw", EXAMPLE_IN)
+        pages.heading("Views that the map never saw")
     for example in data.examples:
-        pages.drawing(EXAMPLE_IN, _example_axes, example)
+        pages.heading(example.caption, size_pt=TEXT_PT)
+        pages.drawing(_example_height_in(example), _example_axes, example)
 
 
 def _words(pages: Pages, data: ReportData) -> None:
@@ -134,19 +146,29 @@ def _words(pages: Pages, data: ReportData) -> None:
     ])  # fmt: skip
 
 
-def _example_axes(figure: Figure, example: HeldOutExample) -> None:
-    """The camera's picture, the map's, and that without water."""
-    pictures: list[tuple[str, npt.NDArray[np.uint8]]] = [
-        ("camera", example.real), ("rendered from the map", example.rendered),
-    ]  # fmt: skip
+def _example_pictures(example: HeldOutExample) -> list[tuple[str, npt.NDArray[np.uint8]]]:
+    """The camera's picture, the map's, and that without water, with their names."""
+    pictures = [("camera", example.real), ("rendered from the map", example.rendered)]
     if example.restored is not None:
         pictures.append(("without the water", example.restored))
+    return pictures
+
+
+def _example_height_in(example: HeldOutExample) -> float:
+    """Of the pictures side by side, as wide as the page, with their names."""
+    pictures = _example_pictures(example)
+    each_in = (TEXT_IN - GAP_IN * (len(pictures) - 1)) / len(pictures)
+    shapes = [each.shape for _, each in pictures]
+    return NAME_IN + each_in * float(max(rows / columns for rows, columns, _ in shapes))
+
+
+def _example_axes(figure: Figure, example: HeldOutExample) -> None:
+    pictures = _example_pictures(example)
     panels = figure.subplots(1, len(pictures), squeeze=False)[0]
     for axes, (name, picture) in zip(panels, pictures, strict=True):
         axes.imshow(picture)
         axes.set_axis_off()
         axes.set_title(name, fontsize=8.0)
-    figure.suptitle(example.caption, fontsize=9.0, x=0.02, ha="left")
 
 
 def _decode(png: bytes) -> npt.NDArray[np.uint8]:
@@ -163,61 +185,97 @@ WIDTH_IN, HEIGHT_IN = 8.27, 11.69
 """A4."""
 MARGIN_IN = 0.75
 """On all sides."""
-TEXT_PT, LINE_IN = 9.0, 0.18
-"""Letters and lines of text."""
-HEADING_IN = 0.45
-"""A heading with the space around it."""
-LETTERS = 100
-"""Of a line of text across the page, on the average of English."""
+TEXT_IN = WIDTH_IN - 2 * MARGIN_IN
+"""Width of what a page holds."""
+HEADER_PT, TEXT_PT, HEADING_PT, TITLE_PT = 8.0, 9.0, 12.0, 20.0
+"""Letters."""
+LINE = 1.45
+"""Height of a line over that of its letters."""
+SPACE_IN = 0.08
+"""Below a block."""
+COLUMN_GAP_IN = 0.2
+"""Between the columns of a table."""
+WHOLE_TABLE_IN = 3.0
+"""Height up to which a table stays on one page."""
+NAMES_SHARE = 0.4
+"""Of the page's width: what the first column of a table takes where there is room, so that tables
+that follow each other are in line."""
 PALE = "#d5e0e4"
 """Grid lines on paper; in the SVG they have a colour of the page's own."""
 
 
+@dataclass(frozen=True)
+class _Line:
+    """Texts at one height."""
+
+    texts: Sequence[tuple[float, str]]
+    """Each after its distance from the left margin, inches."""
+    size_pt: float = TEXT_PT
+    weight: str = "normal"
+
+    @property
+    def height_in(self) -> float:
+        """With the space to the next line."""
+        return self.size_pt * LINE / 72.0
+
+
 class Pages:
-    """Begins a page, and another one whenever that is full."""
+    """Begins a page, and another one whenever what comes has no room on it.
+
+    Everything is measured before it is set: what is too wide is folded, a short table and every row
+    of a long one stay whole, and a heading stays with the first of what follows.
+    """
 
     def __init__(self, pdf: PdfPages, header: str) -> None:
         """``header``: a line at the top of every page."""
-        self._pdf, self._header = pdf, header
+        self._pdf, self._header = pdf, fold(header, TEXT_IN, HEADER_PT)[0]
         self._figure = self._begin_page()
         self._y = HEIGHT_IN - MARGIN_IN
         """Inches from the bottom up to which the page is free."""
+        self._headings: list[_Line] = []
+        """That wait for what they are about."""
 
     def title(self, text: str) -> None:
         """The name of the whole."""
-        self._text(text, 20.0, 0.45, weight="bold", letters=45)
+        self._set(_lines(text, TITLE_PT, "bold"))
 
-    def heading(self, text: str, keep_in: float = 1.0) -> None:
-        """Heading of a section; it stays with so many inches of what follows."""
-        self._room(keep_in + HEADING_IN)
-        self._y -= 0.12
-        self._text(text, 12.0, 0.28, weight="bold", letters=80)
+    def heading(self, text: str, said: str = "", size_pt: float = HEADING_PT) -> None:
+        """Heading of a section, with a sentence about it."""
+        self._headings.append(_Line([], HEADING_PT))
+        self._headings += _lines(text, size_pt, "bold")
+        if said:
+            self._headings += [*_lines(said), _Line([], SPACE_IN * 72.0 / LINE)]
 
     def paragraph(self, text: str) -> None:
         """Folded at the page's width."""
-        self._text(text, TEXT_PT, LINE_IN)
-        self._y -= 0.08
+        self.items([text], mark="")
 
-    def items(self, texts: Iterable[str]) -> None:
+    def items(self, texts: Iterable[str], mark: str = "\u2022 ") -> None:
         """A list."""
         for text in texts:
-            self._text(f"\u2022 {text}", TEXT_PT, LINE_IN)
-        self._y -= 0.08
+            self._set(_lines(mark + text))
+        self._y -= SPACE_IN
 
     def table(self, rows: Sequence[tuple[str, ...]]) -> None:
-        """Rows of a name and its values; names and a single value are folded."""
-        for name, *values in rows:
-            columns = np.linspace(0.0, 1.0, 6)[2:][:: 1 if len(values) > 1 else 4]
-            width = LETTERS // 3 if len(values) > 1 else 3 * LETTERS // 5
-            cells = [textwrap.wrap(name, 2 * LETTERS // 5 - 2) or [""]]
-            cells += [textwrap.wrap(value, width) or [""] for value in values]
-            for line in range(max(map(len, cells))):
-                self._room(LINE_IN)
-                for at, cell in zip((0.0, *columns), cells, strict=False):
-                    if line < len(cell):
-                        self._put(cell[line], at, TEXT_PT)
-                self._y -= LINE_IN
-        self._y -= 0.08
+        """Rows of a name and its values, in columns as wide as their texts need and the page
+        allows."""
+        if not rows:
+            return
+        widths = _column_widths(rows)
+        starts = [sum(widths[:column]) + COLUMN_GAP_IN * column for column in range(len(widths))]
+        blocks = []
+        for row in rows:
+            cells = [fold(text, width, TEXT_PT) for text, width in zip(row, widths, strict=False)]
+            blocks.append([
+                _Line([(start, text) for start, text in zip(starts, line, strict=False) if text])
+                for line in zip_longest(*cells, fillvalue="")
+            ])  # fmt: skip
+        whole = [line for block in blocks for line in block]
+        if sum(line.height_in for line in whole) <= WHOLE_TABLE_IN:
+            blocks = [whole]
+        for block in blocks:
+            self._set(block)
+        self._y -= SPACE_IN
 
     def drawing(self, height_in: float, draw: Callable[[Any, Any], None], data: Any) -> None:
         """What ``draw`` draws of ``data`` into a figure as wide as the page."""
@@ -229,10 +287,10 @@ class Pages:
     def picture(
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB or [H, W, 4] RGBA
-        height_in: float,
+        most_in: float,
     ) -> None:
-        """A picture in the middle of the page."""
-        axes = self._part(height_in).subplots()
+        """A picture in the middle of the page, no higher than ``most_in``."""
+        axes = self._part(min(most_in, TEXT_IN * image.shape[0] / image.shape[1])).subplots()
         axes.imshow(image)
         axes.set_axis_off()
 
@@ -246,29 +304,38 @@ class Pages:
         figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
         top = 1.0 - 0.45 / HEIGHT_IN
         figure.text(
-            MARGIN_IN / WIDTH_IN, top, self._header, fontsize=8.0, color="#56707a", parse_math=False
-        )
+            MARGIN_IN / WIDTH_IN, top, self._header, fontsize=HEADER_PT, color="#56707a",
+            parse_math=False,
+        )  # fmt: skip
         return figure
 
     def _room(self, inches: float) -> None:
-        """Another page where this one has less room."""
-        if self._y - inches < MARGIN_IN:
-            self.close()
-            self._figure, self._y = self._begin_page(), HEIGHT_IN - MARGIN_IN
+        """Another page where this one has less room; then what waits is set."""
+        waits, self._headings = self._headings, []
+        if self._y - inches - sum(line.height_in for line in waits) < MARGIN_IN:
+            self._turn()
+        for line in waits:
+            self._put(line)
 
-    def _text(
-        self, text: str, size_pt: float, line_in: float, letters: int = LETTERS, **style: Any
-    ) -> None:
-        for line in textwrap.wrap(text, letters) or [""]:
-            self._room(line_in)
-            self._put(line, 0.0, size_pt, **style)
-            self._y -= line_in
+    def _turn(self) -> None:
+        self.close()
+        self._figure, self._y = self._begin_page(), HEIGHT_IN - MARGIN_IN
 
-    def _put(self, text: str, at: float, size_pt: float, **style: Any) -> None:
-        """At a share of the page's width, below what is there."""
-        x = (MARGIN_IN + at * (WIDTH_IN - 2 * MARGIN_IN)) / WIDTH_IN
-        y = self._y / HEIGHT_IN
-        self._figure.text(x, y, text, fontsize=size_pt, va="top", parse_math=False, **style)
+    def _set(self, block: Sequence[_Line]) -> None:
+        """Lines that stay together, unless they fill more than a page."""
+        self._room(sum(line.height_in for line in block))
+        for line in block:
+            self._put(line)
+
+    def _put(self, line: _Line) -> None:
+        if self._y - line.height_in < MARGIN_IN:
+            self._turn()
+        for x_in, text in line.texts:
+            self._figure.text(
+                (MARGIN_IN + x_in) / WIDTH_IN, self._y / HEIGHT_IN, text, fontsize=line.size_pt,
+                weight=line.weight, va="top", parse_math=False,
+            )  # fmt: skip
+        self._y -= line.height_in
 
     def _part(self, height_in: float) -> SubFigure:
         """A part of the page, as wide as it."""
@@ -277,11 +344,34 @@ class Pages:
         rest = self._y - height_in
         parts: Any = self._figure.subfigures(
             3, 3, height_ratios=[free, height_in, rest], wspace=0.0, hspace=0.0,
-            width_ratios=[MARGIN_IN, WIDTH_IN - 2 * MARGIN_IN, MARGIN_IN],
+            width_ratios=[MARGIN_IN, TEXT_IN, MARGIN_IN],
         )  # fmt: skip
-        self._y -= height_in
+        self._y -= height_in + SPACE_IN
         part: SubFigure = parts[1, 1]
         return part
+
+
+def _lines(text: str, size_pt: float = TEXT_PT, weight: str = "normal") -> list[_Line]:
+    """``text`` folded at the page's width."""
+    return [_Line([(0.0, line)], size_pt, weight) for line in fold(text, TEXT_IN, size_pt, weight)]
+
+
+def _column_widths(rows: Sequence[tuple[str, ...]]) -> list[float]:
+    """Inches of each column: what its texts need; where the page has less, the widest give way."""
+    columns = list(zip_longest(*rows, fillvalue=""))
+    needs = [max(text_width_in(text, TEXT_PT) for text in column) for column in columns]
+    room = TEXT_IN - COLUMN_GAP_IN * (len(needs) - 1)
+    spare = room - sum(needs)
+    if spare >= 0.0:
+        needs[0] += min(spare, max(0.0, NAMES_SHARE * TEXT_IN - needs[0]))
+        return needs
+    most = room
+    for place, need in enumerate(sorted(needs)):
+        most = room / (len(needs) - place)
+        if need > most:
+            break
+        room -= need
+    return [min(need, most) for need in needs]
 
 
 def _pale(artist: Any) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.change.change_picture import bands_of, grid_of
+from aquaflow.survey.change.change_picture import WORDS, bands_of, change_figure, grid_of
 from aquaflow.survey.change.comparison import (
     BLEACHED,
     GAINED,
@@ -20,6 +20,7 @@ from aquaflow.survey.change.comparison import (
 )
 from aquaflow.survey.change.find_changes import COLUMNS, csv_of, row_of
 from aquaflow.survey.change.patches import NAMES
+from aquaflow.survey.export.ortho.grid import NODATA
 from aquaflow.survey.export.ortho.ground import Ground
 from tests.survey.change.sites import HALF, RESOLUTION, TALL, changes, day, views_of
 
@@ -100,3 +101,12 @@ def test_raster_and_table_hold_what_was_found(tmp_path: Path) -> None:
     lines = csv_of([row]).decode().splitlines()
     assert lines[0].split(",") == list(COLUMNS)
     assert lines[1].startswith("1,gained,")
+
+
+def test_the_picture_names_every_colour_that_it_shows(tmp_path: Path) -> None:
+    days = day(tmp_path, 1), day(tmp_path, 2, HERE)
+    patches, found = changes(*days)
+    figure = change_figure(found, patches, *days, "m")
+    named = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+    shown = set(np.unique(bands_of(found, grid_of(found))[2]).tolist()) - {float(NODATA)}
+    assert named == {WORDS[int(kind)] for kind in shown} >= {"unchanged", "gained"}

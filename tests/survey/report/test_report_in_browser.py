@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.survey.report.data import CameraSummary, HeldOutExample, ReportData
+from aquaflow.survey.report.data import CameraSummary, HeldOutExample, ReefRow, ReportData
 from aquaflow.survey.report.page import render_report
 from tests.browser import Browser, needs_browser
 
@@ -23,6 +23,17 @@ for (const each of document.querySelectorAll(".views figure")) {
 return Object.keys(rows).map(Number).sort((a, b) => a - b).map(top => rows[top]);
 """
 """Pictures in each row, from above."""
+TORN = """
+const pen = document.createElement("canvas").getContext("2d"), torn = [];
+for (const cell of document.querySelectorAll("td")) {
+  pen.font = getComputedStyle(cell).font;
+  const inside = cell.clientWidth - parseFloat(getComputedStyle(cell).paddingRight);
+  const words = cell.textContent.split(" ");
+  torn.push(...words.filter(word => pen.measureText(word).width > inside + 1));
+}
+return torn;
+"""
+"""Words of tables that are wider than their cell."""
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +63,18 @@ def test_no_row_of_a_views_pictures_is_shorter_than_the_others(
     rows = browser.run(ROWS)
     assert sum(rows) == pictures
     assert len(set(rows)) == 1
+
+
+@pytest.mark.parametrize("width", [390, 800, 1280])
+def test_no_table_tears_its_words_or_widens_the_page(
+    browser: Browser, tmp_path: Path, width: int
+) -> None:
+    camera = CameraSummary(640, 360, 544.0, "guessed")
+    meaning = "of the camera; its interval reaches down by what jitter may have added"
+    row = ReefRow("surveyed area", "123.46 \u00b1 12.35 m\u00b2", "100.25 to 150.75", meaning)
+    file = tmp_path / "report.html"
+    file.write_text(render_report(ReportData("d", camera, {}, reef=[row] * 3)))
+    browser.emulate(width, 900)
+    browser.open(file.as_uri())
+    assert browser.run(TORN) == []
+    assert browser.run("return document.documentElement.scrollWidth <= innerWidth")
