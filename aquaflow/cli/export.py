@@ -34,6 +34,8 @@ class ExportFormat(StrEnum):
     glb = "glb"
     ortho = "ortho"
     dem = "dem"
+    geotags = "geotags"
+    odm = "odm"
     mcap = "mcap"
 
 
@@ -49,6 +51,8 @@ NAMES = {
     ExportFormat.glb: "mesh.glb",
     ExportFormat.ortho: "ortho",
     ExportFormat.dem: "dem",
+    ExportFormat.geotags: "geotags.csv",
+    ExportFormat.odm: "geo.txt",
     ExportFormat.mcap: "dive.mcap",
 }
 """Of what is written, in the dive's folder or in ``--out``."""
@@ -69,6 +73,8 @@ OPTIONS = {
     ExportFormat.glb: {"--water", "--resolution", "--white-balance"},
     ExportFormat.ortho: {"--water", "--resolution", "--white-balance"},
     ExportFormat.dem: {"--resolution"},
+    ExportFormat.geotags: set(),
+    ExportFormat.odm: set(),
     ExportFormat.mcap: {"--recording", "--white-balance"},
 }
 """Which options a format knows, besides --out and --json."""
@@ -85,6 +91,8 @@ MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
 """Formats that are triangles, of one surface."""
 FOLDERS = {ExportFormat.restored, *RASTERS, ExportFormat.colmap, ExportFormat.nerfstudio}
 """Formats that fill a folder."""
+TABLES = {ExportFormat.geotags, ExportFormat.odm}
+"""Formats of the path alone."""
 POSED = {ExportFormat.colmap, ExportFormat.nerfstudio}
 """Formats of pictures that are as the camera saw them unless ``--restored`` says otherwise."""
 REPORT = "report.pdf"
@@ -114,10 +122,11 @@ def export(
             "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed. "
             "ply, obj, glb: the surface as triangles. "
             "ortho: the ground from straight above. dem: its heights. "
+            "geotags, odm: where each picture was taken, a table for Metashape or OpenDroneMap. "
             "mcap: all of it for Foxglove and ROS 2."
         ),
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="All formats.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="All formats that the dive has.")] = False,
     recording: Annotated[
         Path | None,
         typer.Option(
@@ -157,10 +166,12 @@ def export(
         raise ArgumentError(
             f"--resolution {resolution:g} is no size of a pixel; give a positive one"
         )
-    from aquaflow.dive.dive import MAP, Dive
+    from aquaflow.dive.dive import FRAMES, MAP, TRAJECTORY, Dive
 
     read = Dive(dive)
-    read.require(MAP)
+    read.require(*((FRAMES, TRAJECTORY) if set(formats) <= TABLES else (MAP,)))
+    if every:
+        formats = all_formats(read)
     if white_balance is not None:
         _choose_white(read, white_balance, water or (not restored and set(formats) <= POSED))
     targets = _targets(dive, formats, out)
@@ -172,6 +183,14 @@ def export(
         typer.echo(json.dumps(facts if len(formats) > 1 else facts[formats[0].value]))
     else:
         typer.echo("\n".join(said for said, _ in done.values()))
+
+
+def all_formats(dive: Dive) -> list[ExportFormat]:
+    """What ``--all`` writes: places of pictures only where the dive has some."""
+    from aquaflow.dive.placement import grid_of
+
+    placed = grid_of(dive.frame) is not None
+    return [each for each in ExportFormat if placed or each not in TABLES]
 
 
 def _asked_formats(format: str | None, every: bool) -> list[ExportFormat]:
@@ -270,6 +289,7 @@ def _write(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
     write = {
         ExportFormat.restored: _restore, ExportFormat.spz: _compress, ExportFormat.mcap: _messages,
         ExportFormat.laz: _points, ExportFormat.e57: _points,
+        ExportFormat.geotags: _geotags, ExportFormat.odm: _geotags,
     }.get(format, _posed_pictures)  # fmt: skip
     return {format: write(job, path, format)}
 
@@ -407,6 +427,19 @@ def _posed_pictures(job: _Job, path: Path, format: ExportFormat) -> tuple[str, d
         job.dive, path, write, job.recording, job.restored, job.progress(format)
     )
     return f"Wrote {count} pictures with their poses to {path}{_source(job)}.", {"frames": count}
+
+
+def _geotags(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
+    from aquaflow.survey.export.geotags import read_geotags, write_geo_txt, write_geotags
+
+    tags = read_geotags(job.dive)
+    write = write_geo_txt if format is ExportFormat.odm else write_geotags
+    write(path, tags)
+    said = (
+        f"Wrote where {len(tags)} pictures were taken to {path}: EPSG:{tags.epsg}, heights above "
+        f"{tags.height_zero}."
+    )
+    return said, {"frames": len(tags), "epsg": tags.epsg, "height_zero": tags.height_zero}
 
 
 def _messages(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:

@@ -30,6 +30,7 @@ from aquaflow.survey.export.ortho.grid import (
     round_to_digits,
 )
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
+from aquaflow.survey.export.ortho.relief import write_relief
 from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -85,7 +86,7 @@ def export_survey(
 
     Args:
         targets: of each kind: a folder, or its file if that ends in .tif; other files of the kind
-            are beside it, NAME_quality.tif for one.
+            are beside it: NAME_quality.tif, or NAME_hillshade.tif and NAME_contours.geojson.
         resolution: side of a pixel, m, or map units where the dive has no metres; None: what a
             pixel of the mapped pictures shows, median.
         water: of an ortho: with the water, as seen from the views' median range.
@@ -109,25 +110,34 @@ def export_survey(
     looked = _Tiles(grid, GroundSplats(shown, ground), ranges, colours)
     layers = {kind: _named(kind, path) for kind, path in targets.items()}
     covered = 0
-    with ExitStack() as files:
-        rasters = []
-        for kind, path in targets.items():
-            made = files.enter_context(_whole(path))
-            tags = _tags(dive, frame, ground, side, through, kind == "ortho")
-            for layer in layers[kind]:
-                raster = files.enter_context(writing_raster(made, layer, grid, ground, tags))
-                rasters.append((layer, raster))
-        for done, tile in enumerate(grid.tiles()):
-            pixels = looked.at(tile)
-            if pixels is not None:
-                covered += int(pixels.mapped.sum())
-                for layer, raster in rasters:
-                    raster.write(tile, layer.values(pixels))
-            if progress is not None:
-                progress("tiles", done + 1, grid.tile_count)
+    with ExitStack() as folders:
+        made = {kind: folders.enter_context(_whole(path)) for kind, path in targets.items()}
+        tags = {
+            kind: _tags(dive, frame, ground, side, through, kind == "ortho") for kind in targets
+        }
+        with ExitStack() as files:
+            rasters = [
+                (layer, files.enter_context(
+                    writing_raster(made[kind], layer, grid, ground, tags[kind])
+                ))
+                for kind in targets
+                for layer in layers[kind]
+            ]  # fmt: skip
+            for done, tile in enumerate(grid.tiles()):
+                pixels = looked.at(tile)
+                if pixels is not None:
+                    covered += int(pixels.mapped.sum())
+                    for layer, raster in rasters:
+                        raster.write(tile, layer.values(pixels))
+                if progress is not None:
+                    progress("tiles", done + 1, grid.tile_count)
+        names = {kind: [layer.name for layer in layers[kind]] for kind in targets}
+        if "dem" in targets:
+            dem = made["dem"] / names["dem"][0]
+            names["dem"] += write_relief(dem, grid, ground, tags["dem"])
     share = covered / (grid.width * grid.height)
     paths = {
-        kind: [(path.parent if _is_file(path) else path) / layer.name for layer in layers[kind]]
+        kind: [(path.parent if _is_file(path) else path) / name for name in names[kind]]
         for kind, path in targets.items()
     }
     return SurveyFiles(paths, grid.width, grid.height, side, share, ground, through)
