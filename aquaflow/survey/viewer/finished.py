@@ -113,7 +113,7 @@ def note_unfinished(folder: Path) -> str:
 
 def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = None) -> ViewerPage:
     """The viewer's page of ``dive``."""
-    page = ViewerPage(config, "AquaFlow", live=False, tools=tools)
+    page = ViewerPage(config, f"{dive.folder.resolve().name}: AquaFlow", live=False, tools=tools)
     fill(page, dive)
     return page
 

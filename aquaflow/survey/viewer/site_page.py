@@ -56,7 +56,7 @@ def open_site(site: Path, config: ViewerConfig, component: int | None = None) ->
     key = _key(shown)
     packed = read_packed(site, key)
     whole = cache(partial(map_of_site, shown, config.splats))
-    page = ViewerPage(config, "AquaFlow", live=False)
+    page = ViewerPage(config, f"{site.resolve().name}: AquaFlow", live=False)
     frame = shown.frame
     page.set_frame(LengthUnit.of(frame), up="-z" if frame.level else "-y", north=frame.north)
     if packed is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import shutil
 from collections.abc import Iterator
@@ -384,6 +385,73 @@ def test_a_live_dive_is_followed(browser: Browser, tmp_path: Path) -> None:
         page.close()
 
 
-def test_nothing_on_the_page_is_wider_than_a_phone(shown: Browser) -> None:
-    shown.emulate(390, 780)
+@pytest.mark.parametrize("width", [390, 800, 1280])
+def test_the_slider_is_long_and_nothing_is_wider_than_the_window(
+    shown: Browser, width: int
+) -> None:
+    shown.emulate(width, 780)
     assert shown.run("return document.documentElement.scrollWidth <= innerWidth")
+    (_, panel_top, _, panel), (_, top, length, _) = box(shown, "#panel"), box(shown, "#pose")
+    assert length >= 300
+    assert panel_top + panel <= top
+    assert shown.text("#where").startswith("0:00 of 1:15")
+
+
+ARROW_LEFT = "\ue012"
+"""A key, as WebDriver names it."""
+SAVED = """
+    HTMLAnchorElement.prototype.click = function () {
+      window.saved = [this.download, this.href];
+    };"""
+FOCAL = """
+    const map = document.querySelector('#map');
+    return aquaflowEye.optics(map.clientWidth, map.clientHeight).fx;"""
+
+
+def test_an_address_leads_back_to_its_view(shown: Browser, page: ViewerPage) -> None:
+    shown.wait("location.hash === '#pose=0'")
+    shown.run("document.querySelector('#marks').focus();")
+    shown.press(ARROW_LEFT)
+    put(shown, "#water", 40)
+    shown.wait("/^#at=.*&to=.*&water=40$/.test(location.hash)")
+    address, before = page.address + shown.run("return location.hash"), eye(shown)[0]
+    shown.open("about:blank")
+    shown.open(address)
+    shown.wait("window.aquaflowTimes && window.aquaflowTimes.whole")
+    assert eye(shown)[0] == pytest.approx(before, abs=1e-3)
+    assert shown.run("return document.querySelector('#water').value") == "40"
+    shown.run("location.hash = '#pose=1';")
+    shown.wait("aquaflowEye.lens && aquaflowEye.place[0] === 1")
+    assert shown.run("return document.querySelector('#water').value") == "0"
+    shown.run("location.hash = '#pose=99';")  # not of this dive: the view stays
+    shown.wait("location.hash === '#pose=99'")
+    assert shown.run("return aquaflowEye.place[0]") == 1
+
+
+def test_a_saved_picture_has_a_scale_and_north(shown: Browser, tmp_path: Path) -> None:
+    """The camera is 5 m above the floor; north is to its right."""
+    import cv2
+
+    on_screen = colour(shown, 0.5, 0.5, tmp_path)
+    shown.run(SAVED)
+    shown.click("#shot")
+    shown.wait("window.saved")
+    name, address = shown.run("return window.saved")
+    assert name == "dive_AquaFlow.png"
+    data = base64.b64decode(address.removeprefix("data:image/png;base64,"))
+    if PICTURES:
+        (Path(PICTURES) / "viewer_saved.png").write_bytes(data)
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    height, width = picture.shape[:2]
+    middle = picture[height // 2 - 6 : height // 2 + 7, width // 2 - 6 : width // 2 + 7]
+    np.testing.assert_allclose(middle.reshape(-1, 3).mean(axis=0)[::-1], on_screen, atol=6.0)
+    focal = shown.run(FOCAL)
+    foot = picture[height - 24 : height - 20, 16 : width // 4 + 40]
+    bar = (foot.min(axis=2).max(axis=0) > 200).sum()
+    lengths = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0])
+    expected = lengths[lengths * focal / 5.0 <= 0.25 * width].max() * focal / 5.0
+    assert bar == pytest.approx(expected, rel=0.03)
+    across = picture[50, width - 50 - 20 : width - 50 + 21].min(axis=1)
+    assert across[-1] > 200
+    assert across[0] < 120

@@ -3,7 +3,8 @@
 import { add, Eye } from "./camera.js";
 import { Drawing } from "./draw.js";
 import { hands } from "./hands.js";
-import { asked, chunk, loadMap } from "./load.js";
+import { Link } from "./link.js";
+import { asked, chunk, loadMap, tell } from "./load.js";
 import { Looks } from "./looks.js";
 import { Marks } from "./marks.js";
 import { TimeLine } from "./timeline.js";
@@ -16,7 +17,10 @@ const say = text => { find("said").textContent = text; };
 
 let scene = null, drawing = null, looking = false, pathShown = -1, loading = false, wrong = "";
 
-const changed = () => { if (drawing) drawing.wanted = true; };
+const changed = () => {
+  if (drawing) drawing.wanted = true;
+  if (looking) link.tell();
+};
 // In ms since the address was opened: the script runs, a first chunk is there, a first picture is on
 // the screen, the whole map is drawn. And what a Gaussian costs, and whether nothing is left to draw.
 const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; } };
@@ -28,7 +32,7 @@ const drawn = () => {
 const eye = new Eye([0, -1, 0]), marks = new Marks(find("marks"));
 const tools = new ToolBox(marks, changed);
 const line = new TimeLine(eye, changed);
-const looks = new Looks(changed);
+const looks = new Looks(changed), link = new Link(eye, line);
 window.aquaflowEye = eye; // for who looks at the page from outside, as its tests do
 
 hands(find("marks"), eye, {
@@ -53,6 +57,21 @@ function home() {
   changed();
 }
 find("home").addEventListener("click", home);
+
+// How far away what lies in the middle is, or what the eye turns about where nothing lies there.
+async function rangeAhead() {
+  const { fx } = eye.optics(marks.canvas.clientWidth, marks.canvas.clientHeight);
+  try {
+    return (await tell("pick", { origin: eye.place, direction: eye.ahead, pixel_rad: 1 / fx })).range;
+  } catch { return eye.distance; }
+}
+
+find("shot").addEventListener("click", async () => {
+  const { picture } = await import("./shot.js"); // comes when it is wanted
+  const made = picture(drawing, marks, eye, scene, await rangeAhead()), save = document.createElement("a");
+  Object.assign(save, { href: made.toDataURL("image/png"), download: `${scene.title.replaceAll(/[^\w.-]+/g, "_")}.png` });
+  save.click();
+});
 
 find("fold").addEventListener("click", () => {
   const open = find("panel").toggleAttribute("data-folded");
@@ -93,7 +112,10 @@ async function update() {
   if (!scene.map) { say("There is no map yet."); return; }
   if (!drawing) await begin();
   looks.offer(scene.map, scene.unit, scene.metres);
-  if (!looking) { looking = true; home(); }
+  if (!looking) {
+    if (!link.follow()) home();
+    looking = true;
+  }
   const done = due && showMap(scene.map, coming).catch(error => say(error.message));
   if (!scene.live) await done;
   say("");
