@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from aquaflow.api.map import Map, load_map
+    from aquaflow.api.measure import measure
     from aquaflow.api.recording import map_recording
     from aquaflow.base.errors import AquaFlowError
     from aquaflow.config import Config
@@ -48,6 +49,7 @@ __all__ = [
     "guess_camera",
     "load_map",
     "map_recording",
+    "measure",
     "read_dive",
     "read_tum",
 ]
@@ -67,6 +69,7 @@ _HOMES = {
     "guess_camera": "aquaflow.geometry.camera",
     "load_map": "aquaflow.api.map",
     "map_recording": "aquaflow.api.recording",
+    "measure": "aquaflow.api.measure",
     "read_dive": "aquaflow.dive.dive",
     "read_tum": "aquaflow.dive.tum",
 }

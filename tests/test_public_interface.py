@@ -19,6 +19,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.restoration import mean_water
 from aquaflow.render import select_renderer
 from aquaflow.water.mounting import Lamp
+from tests.command_line import Cli
 from tests.metric_scenes import metric_frame
 
 HASTY = Path(__file__).with_name("hasty.yaml")
@@ -81,8 +82,26 @@ def test_a_dive_and_its_map_have_one_unit_and_its_table_has_every_pose(small_div
     assert {row.unit for row in rows} == {dive.unit}
 
 
+def test_measures_are_those_of_the_command(small_dive: Path, command: Cli) -> None:
+    dive = aquaflow.read_dive(small_dive)
+    centres = np.asarray(aquaflow.load_map(small_dive).gaussians.means, float)
+    points = [tuple(centre) for centre in np.round(centres[[0, 1]], 6).tolist()]
+    given = [word for point in points for word in ("--point", ",".join(map(str, point)))]
+    said = json.loads(command("measure", small_dive, *given, "--json").out)["measured"]
+    found = aquaflow.measure(dive, points)
+    assert set(found) == set(said)
+    for name, quantity in found.items():
+        assert quantity.value == pytest.approx(said[name]["value"])
+        assert quantity.sigma == pytest.approx(said[name]["sigma"])
+    numbers = json.loads((small_dive / "reef_numbers.json").read_text())["numbers"]
+    ground = aquaflow.measure(small_dive)
+    assert ground["surveyed_area"].value == pytest.approx(numbers["surveyed_area"]["value"])
+    with pytest.raises(aquaflow.AquaFlowError, match="is no point"):
+        aquaflow.measure(dive, ["here", "there"])
+
+
 def test_a_folder_without_a_dive_is_refused_with_its_path(tmp_path: Path) -> None:
-    for read in (aquaflow.read_dive, aquaflow.load_map):
+    for read in (aquaflow.read_dive, aquaflow.load_map, aquaflow.measure):
         with pytest.raises(aquaflow.AquaFlowError, match=str(tmp_path)):
             read(tmp_path)
 
