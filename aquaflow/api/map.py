@@ -63,8 +63,8 @@ class Picture:
 class Map:
     """The map of one sub-map; read it with :func:`load_map`.
 
-    World and unit of length are those of the dive's other files: n and metres where telemetry gave
-    them, else the first keyframe's camera and map units.
+    World and unit of length are those of the dive's other files: n (docs/conventions.md#world-n),
+    and metres where they are known, else map units.
     """
 
     def __init__(self, mapper: Mapper, metric_frame: WorldFrame | None = None) -> None:

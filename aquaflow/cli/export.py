@@ -389,8 +389,9 @@ def _compress(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[st
     from aquaflow.survey.export.spz import export_spz
 
     count, where = export_spz(job.dive, path, job.water)
-    facts = {"gaussians": count, "unit": where.unit}
-    return f"Wrote {count} Gaussians to {path}; lengths are {where.unit}, y is up.", facts
+    axes = where.in_words(y_up=True)
+    facts = {"gaussians": count, "unit": where.unit, "axes": axes}
+    return f"Wrote {count} Gaussians to {path}: {axes}.", facts
 
 
 def _mesh(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
@@ -402,9 +403,10 @@ def _mesh(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
     unit = mesh.where.unit
     for each in together:
         files = [str(file) for file in mesh.files[MESHES[each]]]
+        axes = mesh.where.in_words(y_up=each is ExportFormat.glb)
         said = (
             f"Wrote {' and '.join(files)}: {mesh.triangles} triangles of {mesh.voxel:g} {unit}, "
-            f"{mesh.seen}.\nCoordinates: {mesh.where.in_words()}"
+            f"{mesh.seen}.\nCoordinates: {axes}"
         )
         said += f", less {mesh.origin[0]:g}, {mesh.origin[1]:g}." if mesh.where.epsg else "."
         made[each] = said, {
@@ -412,13 +414,14 @@ def _mesh(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
             "vertices": mesh.vertices, "triangles": mesh.triangles, "area": mesh.area,
             "resolution": mesh.voxel, "sigma": mesh.sigma,
             "texture": None if each is ExportFormat.ply else mesh.texture,
-            "unit": unit, "epsg": mesh.where.epsg, "axes": mesh.where.in_words(),
+            "unit": unit, "epsg": mesh.where.epsg, "axes": axes,
             "origin": mesh.origin, "colours": mesh.seen,
         }  # fmt: skip
     return made
 
 
 def _posed_pictures(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:
+    from aquaflow.dive.placement import placement
     from aquaflow.dive.restored import export_posed_pictures
     from aquaflow.survey.export.posed_pictures import write_colmap, write_nerfstudio
 
@@ -426,7 +429,9 @@ def _posed_pictures(job: _Job, path: Path, format: ExportFormat) -> tuple[str, d
     count = export_posed_pictures(
         job.dive, path, write, job.recording, job.restored, job.progress(format)
     )
-    return f"Wrote {count} pictures with their poses to {path}{_source(job)}.", {"frames": count}
+    where = placement(job.dive.frame)
+    said = f"Wrote {count} pictures with their poses to {path}{_source(job)}: {where.axes}; "
+    return f"{said}{where.unit}.", {"frames": count, "unit": where.unit, "axes": where.axes}
 
 
 def _geotags(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:

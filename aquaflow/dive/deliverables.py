@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import IntEnum
 from functools import partial
@@ -118,13 +118,21 @@ class Deliverables:
         return {index: self.outputs.frame(sub_maps[index]).pose(T) for index, T in poses.items()}
 
     def summarise(self) -> None:
-        """Poses as the map refined them, and the water of each sub-map."""
+        """Poses as the map refined them, the vertical and the water of each sub-map."""
         attempt = self._attempt
+        for sub_map in self.slam.mappers:
+            attempt("the ground's plane", partial(self._find_ground, sub_map))
         refined = attempt("refined poses", lambda: refined_poses(self.slam, self.results))
         self._poses_m = refined or self._poses_m
         self.poses = self._in_n(self._poses_m)
         for sub_map in self.slam.mappers:
             attempt("water summary", partial(self._summarise_water, sub_map))
+
+    def _find_ground(self, sub_map: int) -> None:
+        from aquaflow.dive.shown_views import on_ground  # loads torch
+
+        frame = on_ground(self.outputs.frame(sub_map), self.slam.mappers[sub_map])
+        self.outputs = replace(self.outputs, frames={**self.outputs.frames, sub_map: frame})
 
     def _summarise_water(self, sub_map: int) -> None:
         from aquaflow.dive.map_file import summarise_water  # loads torch

@@ -48,10 +48,9 @@ ROW_TOLERANCE_S = 1e-3
 class Dive:
     """What is in a dive folder; each file is read when it is first asked for, and then kept.
 
-    Where telemetry gave metres and gravity, the world is n: x to north or along the initial
-    heading, y to the right of it, z down, metres. Else it is the camera of the first keyframe (x
-    right, y down, z forward), and the unit of length is the map unit, the median depth of that
-    keyframe; such sub-maps share neither origin nor unit unless they met.
+    The world is n (docs/conventions.md#world-n): ``frame.axes`` has its axes in words, and
+    ``frame.unit`` its unit: metres, or the map unit, the median depth of the first keyframe.
+    Sub-maps that are not both metric and level share neither origin nor unit unless they met.
 
     What is read may raise InputError, or ConfigError for a camera or settings: one sentence that
     names the file, what is wrong with it, and what to do.

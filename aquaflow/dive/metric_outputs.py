@@ -131,7 +131,7 @@ def sub_maps_in_words(frames: list[WorldFrame]) -> str:
 
 def worlds_in_words(frames: Mapping[int, WorldFrame]) -> str:
     """The worlds of the sub-maps, for the first lines of trajectory.tum."""
-    if not any(frame.metric or frame.level or frame.site for frame in frames.values()):
+    if not any(frame.metric or frame.has_vertical or frame.site for frame in frames.values()):
         return CAMERA_WORLD
     said = {number: _world_in_words(frame) for number, frame in frames.items()}
     if len(set(said.values())) == 1:
@@ -142,9 +142,10 @@ def worlds_in_words(frames: Mapping[int, WorldFrame]) -> str:
 def _world_in_words(frame: WorldFrame) -> str:
     whose = f" of {frame.site}, in which this dive was recognised" if frame.site else ""
     axes = f"world is the first keyframe's camera (x right, y down, z forward){whose}"
+    if frame.has_vertical:
+        axes = f"world is n{whose}: {frame.axes}"
     if frame.level:
-        zero = "the water surface" if frame.depth_known else "the start"
-        axes = f"world is n{whose}: x to {frame.north}, y to the right of it, z down from {zero}"
+        axes += f" from {'the water surface' if frame.depth_known else 'the start'}"
     return f"{axes}; unit: {frame.unit}"
 
 

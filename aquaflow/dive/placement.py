@@ -1,8 +1,9 @@
 """Where a dive lies: upright, on the earth and its UTM grid, on a page, and in an earlier dive.
 
-The upright frame u has the origin and the unit of n (docs/conventions.md#world-n). Where gravity is
-known its axes are right, forward and up of what n's x axis points to: east, north, up where that is
-true north. Where nothing is known they are those of the first keyframe's camera.
+The upright frame u, which all exports are in, has the origin and the unit of n
+(docs/conventions.md#world-n). Its axes are right, forward and up of what n's x axis points to:
+east, north, up where that is true north. Where n has no vertical, the first keyframe's camera has
+it.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ class Placement:
     """From n to the upright frame: a rotation alone."""
     unit: str
     """``m`` or ``map units``."""
-    axes: str
-    """The upright frame in words."""
+    directions: tuple[str, str]
+    """What x and y of the upright frame point to, in words."""
     grid: UtmGrid | None = None
     """Where the points are laid on one."""
 
@@ -73,23 +74,27 @@ class Placement:
         """The grid's coordinate reference system in OGC WKT 1, as LAS 1.4 demands; or None."""
         return None if self.grid is None else self.grid.wkt()
 
-    def in_words(self) -> str:
-        """Axes, unit and grid of exported points, in one line."""
-        if self.epsg is None:
-            return f"{self.axes}; {self.unit}"
-        return f"EPSG:{self.epsg}, x easting, y northing, z up; m"
+    @property
+    def axes(self) -> str:
+        """The upright frame in words."""
+        x, y = self.directions
+        return f"x {x}, y {y}, z up"
+
+    def in_words(self, y_up: bool = False) -> str:
+        """Axes, unit and grid of exported points, in one line; ``y_up``: x, z, -y of them."""
+        x, y = self.directions if self.epsg is None else ("easting", "northing")
+        named = f"x {x}, y up, -z {y}" if y_up else f"x {x}, y {y}, z up"
+        return f"{'' if self.epsg is None else f'EPSG:{self.epsg}, '}{named}; {self.unit}"
 
 
 def placement(frame: WorldFrame) -> Placement:
     """The placement of the sub-map that ``frame`` belongs to."""
-    if frame.north == "first keyframe":
-        R, axes = UPRIGHT_FROM_CAMERA, "x right, y forward, z up of the first keyframe's camera"
+    R, directions = UPRIGHT_FROM_DOWN, ("to the right", frame.ahead)
+    if not frame.has_vertical:
+        R, directions = UPRIGHT_FROM_CAMERA, ("right", "into the first keyframe's picture")
     elif frame.north == "true north":
-        R, axes = UPRIGHT_FROM_DOWN, "x east, y north, z up"
-    else:
-        R, axes = UPRIGHT_FROM_DOWN, f"y {frame.north}, x to the right of it, z up"
-    T_un = Sim3(R, np.zeros(3), 1.0)
-    return Placement(T_un, frame.unit, axes, grid_of(frame))
+        directions = "east", "north"
+    return Placement(Sim3(R, np.zeros(3), 1.0), frame.unit, directions, grid_of(frame))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -212,8 +217,7 @@ def georeference(frames: Mapping[int, WorldFrame], main: int) -> dict[str, Any] 
             "source": origin.source,
             "sigma_m": origin.sigma_m,
         },
-        "axes": f"x {frame.north}, y to the right of it, z down; plane that touches the ellipsoid "
-        "at the origin",
+        "axes": f"{frame.axes}; plane that touches the ellipsoid at the origin",
         "unit": frame.unit,
         "heading_sigma_deg": float(np.degrees(frame.heading_sigma_rad)),
         "utm": _utm(origin),
@@ -248,13 +252,13 @@ def _utm(origin: Origin) -> dict[str, Any] | None:
 # --------------------------------------------------------------------------------------------------
 # The plane of a plan view: what points to the right and up on the page.
 
-LEVEL = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-"""Rows: what points right and up on the page, in n, which is north-east-down."""
-FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+LEVEL = UPRIGHT_FROM_DOWN[:2]
+"""Rows: what points right and up on the page, in n, where -z is up."""
+FORWARD = UPRIGHT_FROM_CAMERA[:2]
 FACING = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""The same in a map that is not level, whose axes are the first picture's: right, down, ahead."""
-FROM_ABOVE = "from above"
-"""From where a LEVEL page is seen."""
+"""The same where n has no vertical, and has the first picture's axes: right, down, ahead."""
+FROM_ABOVE, OFF_GROUND = "from above", "square to the ground"
+"""From where a LEVEL page is seen: with gravity, and for want of it."""
 
 
 def page_axes(
@@ -262,7 +266,7 @@ def page_axes(
     path: Array,  # [N, 3] camera centres, n
 ) -> Array:
     """[2, 3] the directions of n that are right and up on the page: LEVEL, FORWARD or FACING."""
-    if frame.level:
+    if frame.has_vertical:
         return LEVEL
     spread = np.ptp(path, axis=0)
     return FORWARD if spread[2] >= spread[1] else FACING
@@ -281,8 +285,8 @@ def names_of(frame: WorldFrame, axes: Array) -> tuple[str, str, str]:  # [2, 3] 
         return "as in the first picture", "right", "up"
     if axes is FORWARD:
         return "from above the first picture", "right of it", "ahead of it"
-    north = frame.north
-    return FROM_ABOVE, "east" if north.endswith("north") else f"right of the {north}", north
+    seen, up = FROM_ABOVE if frame.level else OFF_GROUND, frame.ahead
+    return seen, "east" if up.endswith("north") else f"right of the {up}", up
 
 
 # --------------------------------------------------------------------------------------------------

@@ -87,6 +87,7 @@ def frame_to_json(frame: WorldFrame) -> dict[str, Any]:
         "origin": None if frame.origin is None else asdict(frame.origin),
         "scale_source": frame.scale_source,
         "sources": [asdict(source) for source in frame.sources],
+        **({"on_ground": True} if frame.on_ground else {}),
         **({"clock_offset_s": frame.clock_offset_s} if frame.clock_offset_s else {}),
         **({"site": frame.site} if frame.site else {}),
     }
@@ -131,6 +132,7 @@ def frame_of_json(stated: dict[str, Any]) -> WorldFrame:
         covariance=covariance,
         metric=bool(stated["metric"]),
         level=bool(stated["level"]),
+        on_ground=bool(stated.get("on_ground", False)),
         north=stated["north"],
         depth_known=bool(stated["depth_known"]),
         origin=None if origin is None else Origin(**origin),

@@ -2,19 +2,19 @@
 
 The world frame n is local north-east-down: x points north (or along the initial heading, where no
 compass is trusted), y to the right of it, z down. Its origin is the body at the dive's first pose,
-at the water surface where depth is measured. A map without telemetry stays as it is: T_nm is the
-identity and the unit is the map's own.
+at the water surface where depth is measured. Without gravity z points into the ground where the
+cameras look squarely at one; else a map stays as it is, and T_nm is the identity but for the scale.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.similarity import Sim3, hat
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, hat
 
 Array = npt.NDArray[np.float64]
 
@@ -30,6 +30,9 @@ UNKNOWN_SIGMA = 1e3
 """1 sigma, in m, rad and log-scale, of a direction that nothing has measured."""
 MAP_UNIT = "the median depth of the first keyframe is 1 map unit"
 """The unit of length of a map whose scale is unknown (see tracking/initialisation)."""
+
+PICTURE_TOP = "first picture's top"
+"""What x points to where z points into the ground."""
 
 MARKED = "marked by hand"
 """Reason in the report of what a person marked in a finished dive: something better replaces it."""
@@ -76,6 +79,9 @@ class WorldFrame:
     """True if lengths are metres."""
     level: bool = False
     """True if z points down."""
+    on_ground: bool = False
+    """True if z points into the ground instead, across its mean plane (dive/shown_views.py), and x
+    to the top of the first picture: gravity is unknown."""
     north: North = "first keyframe"
     depth_known: bool = False
     """True if z = 0 is the water surface."""
@@ -109,6 +115,24 @@ class WorldFrame:
         return bool(T.scale == 1.0 and not T.t.any() and (np.eye(3) == T.R).all())
 
     @property
+    def has_vertical(self) -> bool:
+        """True if -z is up: against gravity, or for want of it away from the ground."""
+        return self.level or self.on_ground
+
+    @property
+    def ahead(self) -> str:
+        """What x points to, in words; empty where n has no vertical."""
+        return self.north if self.level else PICTURE_TOP if self.on_ground else ""
+
+    @property
+    def axes(self) -> str:
+        """The axes of n in words."""
+        if not self.has_vertical:
+            return "x right, y down, z forward of the first keyframe's camera"
+        z = "down" if self.level else "into the ground"
+        return f"x to {self.ahead}, y to the right of it, z {z}"
+
+    @property
     def georeferenced(self) -> bool:
         """True if every point of n has a latitude and a longitude."""
         known = self.origin is not None and self.metric and self.level
@@ -122,6 +146,16 @@ class WorldFrame:
     def gravity_measured(self) -> bool:
         """True if telemetry has measured gravity."""
         return self.level and not self.is_marked(GRAVITY)
+
+    def turn(
+        self,
+        R: Array,  # [3, 3] from n
+    ) -> WorldFrame:
+        """The same with other axes, about the same origin."""
+        T = Sim3(R, np.zeros(3))
+        carried = Sim3Batch.of([T]).adjoint()[0]
+        covariance = carried @ self.covariance @ carried.T
+        return replace(self, T_nm=T @ self.T_nm, covariance=covariance)
 
     def pose(self, T_mc: Sim3) -> Sim3:
         """T_nc of a camera: rigid, as lengths in n have one unit; the same object if n is m."""

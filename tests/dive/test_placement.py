@@ -8,7 +8,6 @@ import pytest
 from aquaflow.dive.placement import placement
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.ortho.ground import ground_of
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from tests.metric_scenes import metric_frame
 from tests.survey.export.survey_scenes import surveyed
 
@@ -18,7 +17,7 @@ def test_a_raster_and_a_cloud_have_the_same_coordinates(placed: bool) -> None:
     frame = metric_frame(T_nm=Sim3.identity())
     if not placed:
         frame = metric_frame(T_nm=Sim3.identity(), origin=None, north="initial heading")
-    ground, where = ground_of(frame, ShownViews(surveyed(frame))), placement(frame)
+    ground, where = ground_of(frame, surveyed(frame)), placement(frame)
     assert (ground.epsg, ground.unit) == (where.epsg, where.unit)
     assert (ground.epsg is not None) == placed
     # Half a kilometre around; the raster is one affine map there, which costs some millimetres.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from tests.metric_scenes import metric_frame
 
 
 def written(folder: Path) -> dict[int, WorldFrame]:
-    frames = {0: WorldFrame.unknown(), 2: metric_frame()}
+    on_ground = replace(WorldFrame.unknown(), on_ground=True)
+    frames = {0: WorldFrame.unknown(), 1: on_ground, 2: metric_frame()}
     write_metric_file(folder, frames, main=2)
     return frames
 
@@ -34,6 +36,7 @@ def test_frames_are_read_back_as_they_were(tmp_path: Path) -> None:
         for name in (
             "metric",
             "level",
+            "on_ground",
             "north",
             "depth_known",
             "origin",

@@ -28,7 +28,6 @@ from aquaflow.survey.change.registration import Registration, register
 from aquaflow.survey.change.surface import Progress, Surface, surface_of
 from aquaflow.survey.export.ortho.geotiff import require_rasterio
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 
 FORMAT = 1
 """Of change.json; raised whenever an older AquaFlow could no longer read it."""
@@ -109,7 +108,7 @@ def find_changes(asked: ChangeSettings, work: Path, progress: Progress) -> Chang
     """
     earlier, later = Dive(asked.first), Dive(asked.second)
     one, frame, other = earlier.filled_map(), earlier.frame, later.filled_map()
-    ground = ground_of(frame, ShownViews(one))
+    ground = ground_of(frame, one)
     first, voxel = surface_of(one, ground.T_gm, work, None, progress)
     second, _ = surface_of(other, ground.T_gm @ asked.T_ab, work, voxel, progress)
     resolution = max(first.resolution, second.resolution)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.service import CoverageConfig
-from aquaflow.dive.placement import FROM_ABOVE, names_of, page_axes
+from aquaflow.dive.placement import FROM_ABOVE, OFF_GROUND, names_of, page_axes
 from aquaflow.survey.coverage.classes import COLOURS, CoverageClass
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
@@ -51,9 +51,9 @@ class PageView:
 
     @property
     def areas(self) -> dict[str, float] | None:
-        """m^2 of each class by name; None where the page is not level or not in metres: on it the
-        ground has another size than on a chart."""
-        if self.seen != FROM_ABOVE or self.unit != "m":
+        """m^2 of each class by name; None where the page is not the ground's or not in metres:
+        there the ground has another size than on a chart."""
+        if self.seen not in (FROM_ABOVE, OFF_GROUND) or self.unit != "m":
             return None
         return {seen.name.lower(): self.area(seen) for seen in COLOURS}
 

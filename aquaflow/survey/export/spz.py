@@ -50,7 +50,7 @@ def export_spz(dive: Dive, path: Path, water: bool = False) -> tuple[int, Placem
     Raises:
         InputError: the dive has no map, or the file cannot be written.
     """
-    where = placement(dive.frame)
+    where = replace(placement(dive.frame), grid=None)  # whose numbers are too large
     turned = replace(where, T_un=Sim3(RIGHT_UP_BACK, np.zeros(3), 1.0) @ where.T_un)
     splats = read_splats(dive, turned, water)
     write_spz(path, splats)

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.shown_views import ShownViews
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.measure.asked import Asked, GeodeticPoint, locate
 from aquaflow.survey.measure.drawn_heights import Progress, draw_heights
 from aquaflow.survey.measure.height_field import HeightField
@@ -111,10 +111,9 @@ def answer(
     ground: Ground | None = None
     notes: list[str] = []
     if chosen != "line" or any(isinstance(each, GeodeticPoint) for each in asked):
-        shown = ShownViews(mapper)
         try:
-            ground = ground_of(frame, shown)
-            drawn = draw_heights(shown, ground, work, cell, progress)
+            ground = ground_of(frame, mapper)
+            drawn = draw_heights(ShownViews(mapper), ground, work, cell, progress)
         except InputError as error:
             if ground is not None or chosen != "area":
                 raise

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.shown_views import ShownViews
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
 from aquaflow.survey.export.ortho.grid import Grid
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.survey.measure.height_field import Array, Counts, HeightField, Held
 from aquaflow.water.sightings import SOLID

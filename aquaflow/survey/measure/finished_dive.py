@@ -68,12 +68,11 @@ def numbers_at_the_end(dive: Dive, until: Deadline) -> ReefNumbers:
 def _draw(
     dive: Dive, mapper: Mapper, work: Path, cell: float | None, progress: Progress | None
 ) -> tuple[HeightField, Ground]:
-    from aquaflow.survey.export.ortho.shown_views import ShownViews  # loads torch
+    from aquaflow.dive.shown_views import ShownViews  # loads torch
     from aquaflow.survey.measure.drawn_heights import draw_heights
 
-    shown = ShownViews(mapper)
-    ground = ground_of(dive.frame, shown)
-    return draw_heights(shown, ground, work, cell, progress), ground
+    ground = ground_of(dive.frame, mapper)
+    return draw_heights(ShownViews(mapper), ground, work, cell, progress), ground
 
 
 def _places(dive: Dive) -> npt.NDArray[np.float64]:

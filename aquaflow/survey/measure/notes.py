@@ -72,10 +72,11 @@ def write_notes(dive: Path, notes: Sequence[Note], frame: WorldFrame) -> None:
         raise InputError(f"a dive holds {MOST_NOTES} notes at most; remove some")
     located = frame.georeferenced
     about = {
-        "format": FORMAT, "unit": frame.unit, "located": located,
-        "local_axes": f"x {frame.north}, y to the right of it, z down" if frame.level
-        else "x right, y down, z forward of the first keyframe's camera",
-    }  # fmt: skip
+        "format": FORMAT,
+        "unit": frame.unit,
+        "located": located,
+        "local_axes": frame.axes,
+    }
     features = [_to_feature(note, frame) for note in notes]
     data = {"type": "FeatureCollection", "aquaflow": about, "features": features}
     write_json(dive / NAME, data)

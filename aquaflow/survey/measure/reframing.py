@@ -118,6 +118,7 @@ def level(
         T_nm=Sim3(R_ln, np.zeros(3)) @ frame.T_nm,
         covariance=covariance,
         level=True,
+        on_ground=False,
         north="initial heading",
         sources=_with_marked(frame, report),
     )

@@ -80,12 +80,13 @@ def _path(dive: Dive) -> PathPlot:
     classes = {row.index: row.frame_class for row in dive.frames}
     own = [dive.frame_of(number) for number in {row.sub_map for row in rows}]
     level = bool(own) and all(each.level for each in own)
+    ahead = {each.ahead for each in own}
     return PathPlot(
         np.array([(row.x, row.y, row.z) for row in rows]).reshape(-1, 3),
         [classes.get(row.index, "common") for row in rows],
         [row.sub_map for row in rows],
         unit=frame.unit,
-        up=frame.north if level else "",
+        up=frame.ahead if len(ahead) == 1 else "",
         depth_known=frame.depth_known,
         placed=level and all(each.metric for each in own),
     )
@@ -249,13 +250,13 @@ def _unit(frame: WorldFrame) -> str:
 
 def _gravity(frame: WorldFrame) -> str:
     if not frame.level:
-        return "unknown: the world is turned as the first keyframe's camera"
+        return f"unknown: {frame.axes}"
     return f"z points down, \u00b1 {np.degrees(frame.tilt_sigma_rad):.2g} degrees"
 
 
 def _north(frame: WorldFrame) -> str:
     if not frame.level:
-        return "to the right in the first keyframe"
+        return f"to the {frame.ahead or 'right in the first keyframe'}"
     if frame.north in {"true north", "magnetic north"}:
         return f"to {frame.north}, \u00b1 {np.degrees(frame.heading_sigma_rad):.2g} degrees"
     return f"to {frame.north}; where north is, is unknown"

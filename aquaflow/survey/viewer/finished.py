@@ -80,7 +80,7 @@ def frame_in_words(frame: WorldFrame) -> str:
     unit = "Lengths are map units"
     if frame.metric:
         unit = f"Lengths are metres, \u00b1 {100.0 * frame.scale_sigma:.2g} %"
-    return f"{unit}; x points to {frame.north}, z down" if frame.level else unit
+    return f"{unit}; {frame.axes}"
 
 
 def finished_dive(dive: Dive, budget: int) -> FinishedDive:
@@ -131,9 +131,7 @@ def show_folder(folder: Path, config: ViewerConfig) -> ViewerPage:
 
 def fill(page: ViewerPage, dive: FinishedDive) -> None:
     """Show ``dive`` on ``page``, in place of what was there."""
-    page.set_frame(
-        LengthUnit.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
-    )
+    page.set_frame(LengthUnit.of(dive.frame), dive.frame.north)
     page.show_health(dive.summary)
     if dive.packed is not None:
         page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)

@@ -37,13 +37,13 @@ class LengthUnit:
     scale: Scale
     metres: float = 1.0
     """Of the scale's unit in a unit of what is shown: live maps are shown in their own units."""
-    level: bool = False
-    """Up is against gravity."""
+    has_vertical: bool = False
+    """Up is against gravity, or for want of it away from the ground."""
 
     @staticmethod
     def of(frame: WorldFrame) -> LengthUnit:
         """Unit of a finished dive, whose files are in n."""
-        return LengthUnit(scale_of(frame), level=frame.level)
+        return LengthUnit(scale_of(frame), has_vertical=frame.has_vertical)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def measure(what: str, asked: Sequence[Asked], scene: MeasuringScene) -> Asked:
     if what == "area":
         points = _points(places, sigmas, scene)
         found = {"area": area(points, scale)}
-        if scene.frame.level:
+        if scene.frame.has_vertical:
             found["on a chart"] = plan_area(points, scene.up, scale)
         return _quantities_in_words(found)
     if what == "profile":
@@ -172,12 +172,12 @@ def _rays(
     ends: Array,  # [N, 3]
     scene: MeasuringScene,
 ) -> list[tuple[ViewerSplats, Array, Array, float, float]]:
-    """From straight above where up is against gravity; else from the eye that saw the first end.
+    """From straight above where there is a vertical; else from the eye that saw the first end.
     Each is as wide as half the way to the next."""
     shares = np.linspace(0.0, 1.0, PROFILE_POINTS)[:, None]
     line = (1.0 - shares) * ends[0] + shares * ends[-1]
     width = 0.5 * float(np.linalg.norm(ends[-1] - ends[0])) / PROFILE_POINTS
-    if not scene.frame.level:
+    if not scene.frame.has_vertical:
         eye, _, pixel = ray_of(asked[0])
         near = within_reach(scene.splats, eye, line[[0, -1]] - eye, width)
         ranges = np.maximum(np.linalg.norm(line - eye, axis=1), LEAST_SIGMA)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +39,8 @@ Float = npt.NDArray[np.floating[Any]]
 
 WATCHED_S = 10.0
 """After its last question a browser is gone: it asks twice a second."""
-UP = {"-y": (0.0, -1.0, 0.0), "-z": (0.0, 0.0, -1.0)}
+UP, FIRST_CAMERA_UP = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
+"""Of a world with a vertical, and of one without."""
 
 
 class ViewerPage:
@@ -62,7 +63,7 @@ class ViewerPage:
             InputError: the address is taken.
             ConfigError: the token will not do.
         """
-        self._exhibit = ViewerContent(title, UP["-y"], live)
+        self._exhibit = ViewerContent(title, FIRST_CAMERA_UP, live)
         self._tools = tools or Tools()
         self._tools.exhibit = self._exhibit
         self._exhibit.can = self._tools.can()
@@ -144,13 +145,13 @@ class ViewerPage:
         """The panel's text: paragraphs."""
         self._exhibit.health = text
 
-    def set_frame(self, frame: LengthUnit, up: Literal["-y", "-z"] = "-y", north: str = "") -> None:
-        """The unit of lengths, how well it is known, and which axis of the world points up: by
-        default the first camera's, whose y points down. ``north``: what headings begin at."""
+    def set_frame(self, frame: LengthUnit, north: str = "") -> None:
+        """The unit of lengths, how well it is known, and whether the world has a vertical: else up
+        is the first camera's, whose y points down. ``north``: what headings begin at."""
         self._exhibit.north = north
         self._tools.frame = frame
         self._exhibit.unit, self._exhibit.metres = frame.scale.unit, frame.metres
-        self._exhibit.up = UP[up]
+        self._exhibit.up = UP if frame.has_vertical else FIRST_CAMERA_UP
 
 
 # --------------------------------------------------------------------------------------------------

@@ -58,7 +58,7 @@ def open_site(site: Path, config: ViewerConfig, component: int | None = None) ->
     whole = cache(partial(map_of_site, shown, config.splats))
     page = ViewerPage(config, f"{site.resolve().name}: AquaFlow", live=False)
     frame = shown.frame
-    page.set_frame(LengthUnit.of(frame), up="-z" if frame.level else "-y", north=frame.north)
+    page.set_frame(LengthUnit.of(frame), frame.north)
     if packed is not None:
         page.show_packed(packed, lambda: whole().splats, None, packed.palettes)
         count, total = packed.count, packed.total

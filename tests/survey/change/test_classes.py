@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.dive.placement import Placement
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.change_picture import WORDS, bands_of, change_figure, grid_of
 from aquaflow.survey.change.comparison import (
@@ -26,7 +27,8 @@ from tests.survey.change.sites import HALF, RESOLUTION, TALL, changes, day, view
 
 HERE = (0.05, -0.05)
 VOLUME = TALL * (2.0 * HALF) ** 2
-GROUND = Ground(Sim3.identity(), "m", None, (0.0, 0.0), 1.0, "x, y", "up", "0")
+WHERE = Placement(Sim3.identity(), "m", ("right", "forward"))
+GROUND = Ground(Sim3.identity(), WHERE, (0.0, 0.0), 1.0, "up", "0")
 
 
 def test_an_unchanged_ground_under_other_light_has_no_patches(tmp_path: Path) -> None:

@@ -214,7 +214,7 @@ def test_a_surface_of_few_voxels_is_written(dive: Path, tmp_path: Path) -> None:
 def test_what_fails_leaves_nothing_behind(
     few_views: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*given: object) -> None:
+    def interrupted(*given: object, y_up: bool = False) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(

@@ -14,7 +14,6 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.export.ortho.sightings import ViewRanges
 from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import gaussians_at
@@ -31,7 +30,7 @@ def mapper() -> Mapper:
 
 def ground(mapper: Mapper) -> Ground:
     frame = metric_frame(T_nm=Sim3.identity(), origin=None, north="initial heading")
-    return ground_of(frame, ShownViews(mapper))
+    return ground_of(frame, mapper)
 
 
 def ground_point(north: float, east: float, above: float = 0.0) -> Array:

@@ -19,6 +19,7 @@ from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.cli import app
 from aquaflow.cli.export import ExportFormat
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.shown_views import on_ground
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.ortho import grid as grid_module
 from aquaflow.survey.export.ortho.survey import export_survey
@@ -194,21 +195,30 @@ def test_files_are_cloud_optimised_and_say_what_they_are(dive: Path, tmp_path: P
     assert "poses are taken as exact" in said["SIGMA"]
 
 
-def test_a_dive_without_a_place_lies_in_local_metres(local_dive: Path, tmp_path: Path) -> None:
+def test_a_dive_without_a_place_has_no_eastings(local_dive: Path, tmp_path: Path) -> None:
+    """Readers of a GeoTIFF call the axes of any local system easting and northing."""
     survey = export_survey(Dive(local_dive), {"dem": tmp_path})
     _, dataset = read(tmp_path / "dem.tif")
     assert survey.ground.epsg is None
+    assert dataset.crs is None
+    said = tags(tmp_path / "dem.tif")
+    assert (said["UNIT"], said["AXES"]) == ("m", "x to the right, y initial heading, z up; m")
+
+
+def test_a_dive_that_knows_north_but_no_place_lies_in_local_metres(tmp_path: Path) -> None:
+    frame = metric_frame(T_nm=Sim3.identity(), origin=None)
+    dive = write_survey(tmp_path / "d", surveyed(frame), frame)
+    export_survey(Dive(dive), {"dem": tmp_path})
+    _, dataset = read(tmp_path / "dem.tif")
     assert dataset.crs.to_epsg() is None
     assert 'UNIT["metre",1' in dataset.crs.to_wkt()
-    assert "initial heading" in tags(tmp_path / "dem.tif")["AXES"]
+    assert "x east, y north" in dataset.crs.to_wkt()
 
 
 def test_a_dive_without_metres_and_gravity_says_so(tmp_path: Path) -> None:
-    frame = WorldFrame.unknown()
-    upright = metric_frame(T_nm=Sim3.identity())
-    survey = export_survey(
-        Dive(write_survey(tmp_path / "d", surveyed(upright), frame)), {"dem": tmp_path}
-    )
+    mapper = surveyed(metric_frame(T_nm=Sim3.identity()))
+    frame = on_ground(WorldFrame.unknown(), mapper)
+    survey = export_survey(Dive(write_survey(tmp_path / "d", mapper, frame)), {"dem": tmp_path})
     bands, dataset = read(tmp_path / "dem.tif")
     assert dataset.crs is None
     assert tags(tmp_path / "dem.tif")["UNIT"] == "map units"
@@ -226,7 +236,8 @@ def test_views_that_look_all_around_have_no_vertical(tmp_path: Path) -> None:
     for number, view in enumerate(mapper.views):
         turn = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.5 * np.pi * number, 0.0, 0.0, 0.0]))
         view.T_wc = Sim3(turn.R @ LOOKS_DOWN, view.T_wc.t)
-    dive = write_survey(tmp_path / "d", mapper, WorldFrame.unknown())
+    frame = on_ground(WorldFrame.unknown(), mapper)
+    dive = write_survey(tmp_path / "d", mapper, frame)
     with pytest.raises(InputError, match="says which way is down"):
         export_survey(Dive(dive), {"dem": tmp_path})
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.shown_views import ShownViews
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.measure.areas import areas
 from aquaflow.survey.measure.drawn_heights import draw_heights, found_cell
 from aquaflow.survey.measure.height_field import HeightField
@@ -47,7 +47,7 @@ def drawn(mapper: Mapper, tmp_path_factory: pytest.TempPathFactory) -> HeightFie
 
 
 def ground(mapper: Mapper) -> Ground:
-    return ground_of(FRAME, ShownViews(mapper))
+    return ground_of(FRAME, mapper)
 
 
 def truth(field: HeightField) -> HeightField:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from aquaflow.dive.placement import Placement
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.ortho.ground import ALONG_GRAVITY, Ground
 from aquaflow.survey.measure.quantity import Quantity, Scale
@@ -18,16 +19,8 @@ WATER = DiveWater([0.3, 0.2, 0.4], [0.05] * 3)
 
 def found(scale: Scale, water: DiveWater = WATER) -> ReefNumbers:
     """Of a slope of 20 degrees with waves."""
-    ground = Ground(
-        Sim3.identity(),
-        scale.unit,
-        None,
-        (0.0, 0.0),
-        1.0,
-        "x, y",
-        ALONG_GRAVITY,
-        "the dive's start",
-    )
+    where = Placement(Sim3.identity(), scale.unit, ("right", "forward"))
+    ground = Ground(Sim3.identity(), where, (0.0, 0.0), 1.0, ALONG_GRAVITY, "the dive's start")
     steep = float(np.tan(np.radians(20.0)))
     drawn = field(lambda x, y: steep * x + 0.1 * np.sin(3.0 * y))
     return reef_numbers(lambda: (drawn, ground), PATH, water, scale)

@@ -125,7 +125,7 @@ def test_a_metric_dive_says_its_unit_and_has_its_z_axis_down(dive: Path) -> None
     assert "map units" in finished_dive(Dive(dive), budget=50).summary
     write_metric_file(dive, {0: metric_frame()}, main=0)
     shown = finished_dive(Dive(dive), budget=50)
-    assert "metres, \u00b1 0.4 %; x points to true north, z down" in shown.summary
+    assert "metres, \u00b1 0.4 %; x to true north, y to the right of it, z down" in shown.summary
     page = open_dive(dive, ViewerConfig(port=0, splats=100))
     try:
         scene = page._exhibit.scene()

@@ -16,7 +16,7 @@ from tests.survey.viewer.planes import DEPTH, floor
 
 EYE = np.array([0.3, -0.2, 0.0])
 UP = np.array([0.0, 0.0, -1.0])
-METRES = LengthUnit(Scale("m", 0.0, 0.0), level=True)
+METRES = LengthUnit(Scale("m", 0.0, 0.0), has_vertical=True)
 
 
 def scene(frame: LengthUnit = METRES) -> MeasuringScene:
@@ -115,7 +115,7 @@ def test_three_points_are_an_area() -> None:
 
 @pytest.mark.parametrize("level", [True, False])
 def test_a_profile_of_a_plane_is_flat(level: bool) -> None:
-    frame = LengthUnit(Scale("m", 0.0, 0.0), level=level)
+    frame = LengthUnit(Scale("m", 0.0, 0.0), has_vertical=level)
     said = measure("profile", [point(-2.0, 1.0), point(2.0, 1.0)], scene(frame))
     line = said["profile"]
     assert len(line["along"]) == len(line["height"]) == 64

@@ -81,7 +81,10 @@ def _describe(
         for start, each, target in zip(starts, data, targets, strict=False)
     ]
     return {
-        "asset": {"version": "2.0", "generator": f"AquaFlow {__version__}", "extras": mesh.facts()},
+        "asset": {
+            "version": "2.0", "generator": f"AquaFlow {__version__}",
+            "extras": mesh.facts(y_up=True),
+        },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

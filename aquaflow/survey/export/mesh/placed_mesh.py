@@ -45,11 +45,11 @@ class PlacedMesh:
     seen: str
     """``without water``, or through how much of it."""
 
-    def facts(self) -> dict[str, Any]:
-        """What coordinates and colours mean, for machines."""
+    def facts(self, y_up: bool = False) -> dict[str, Any]:
+        """What coordinates and colours mean, for machines; ``y_up``: of a file with x, z, -y."""
         return {
             "unit": self.where.unit,
-            "axes": self.where.in_words(),
+            "axes": self.where.in_words(y_up),
             "epsg": self.where.epsg,
             "origin": list(self.origin),
             "colours": self.seen,

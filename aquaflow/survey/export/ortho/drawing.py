@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from aquaflow.dive.map_file import splats_of
+from aquaflow.dive.shown_views import ShownViews
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
@@ -25,7 +26,6 @@ from aquaflow.render.limits import RADIUS_SIGMAS
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
 from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.water.tone import ShownTone
 
 Array = npt.NDArray[np.float64]

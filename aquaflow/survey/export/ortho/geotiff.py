@@ -21,7 +21,8 @@ from aquaflow.survey.export.ortho.ground import Ground
 CACHE_MB = 64
 """GDAL's cache of blocks; it takes a twentieth of the memory otherwise."""
 LOCAL_METRES = 'LOCAL_CS["{name}",UNIT["metre",1],AXIS["X",EAST],AXIS["Y",NORTH]]'
-"""A coordinate system that says metres, and nothing of the earth."""
+"""A coordinate system that says metres, and nothing of the place. GeoTIFF keeps no axes of one:
+every reader calls them easting and northing."""
 
 
 def require_rasterio() -> Any:
@@ -106,12 +107,12 @@ def _optimise(tiled: Path, part: Path, layer: RasterFile) -> None:
 
 
 def _crs(ground: Ground) -> Any:
-    """None where lengths are map units."""
+    """None where lengths are map units, or x is not east."""
     from rasterio.crs import CRS
 
     if ground.epsg is not None:
         return CRS.from_epsg(ground.epsg)
-    if ground.unit == "m":
+    if ground.unit == "m" and ground.where.directions == ("east", "north"):
         return CRS.from_wkt(LOCAL_METRES.format(name=f"AquaFlow: {ground.axes}"))
     return None
 

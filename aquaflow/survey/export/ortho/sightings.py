@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import scratch_array
+from aquaflow.dive.shown_views import OPEN, solid_ranges
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View, in_time
 from aquaflow.survey.export.ortho.ground import Ground
-from aquaflow.survey.export.ortho.shown_views import OPEN, solid_ranges
 
 Array = npt.NDArray[np.float64]
 

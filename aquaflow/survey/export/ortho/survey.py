@@ -16,6 +16,7 @@ import numpy.typing as npt
 from aquaflow import __version__
 from aquaflow.base.storage.whole_folder import whole_files, whole_folder
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.shown_views import ShownViews
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, Colours, GroundSplats
 from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
@@ -31,7 +32,6 @@ from aquaflow.survey.export.ortho.grid import (
 )
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.relief import write_relief
-from aquaflow.survey.export.ortho.shown_views import ShownViews
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.sightings import SOLID
@@ -99,7 +99,7 @@ def export_survey(
     require_rasterio()
     mapper, frame = dive.filled_map(), dive.frame
     shown = ShownViews(mapper)
-    ground = ground_of(frame, shown)
+    ground = ground_of(frame, mapper)
     work = next(iter(targets.values())).parent
     ranges = ViewRanges(mapper, ground, work, progress and partial(progress, "views"))
     side = resolution or round_to_digits(ranges.footprint)
@@ -238,7 +238,7 @@ def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
     from PIL import Image
 
     shown = ShownViews(mapper)
-    ground = ground_of(frame, shown)
+    ground = ground_of(frame, mapper)
     low, high, distance = _extent(shown, ground)
     pixel = round_to_digits(float((high - low).max()) / LONGER_SIDE_PX)
     grid = Grid.around(low, high, pixel, low)

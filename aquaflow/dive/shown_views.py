@@ -1,18 +1,23 @@
-"""What some views of a map show: points of the ground, its mean plane, and open water."""
+"""What some views of a map show: points of the ground, its mean plane, and open water.
+
+Where gravity is unknown, that plane gives the world frame n its vertical, once, at the dive's end.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.similarity import nearest_rotation
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.optimise.robust import Cauchy, sigma_of
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.sightings import AGREEING, SOLID
 
 Array = npt.NDArray[np.float64]
@@ -33,6 +38,10 @@ KERNEL = Cauchy(2.4)
 LARGEST_RELIEF = 0.5
 """Thickness of what has a plane, over its lesser width, both as standard deviations: judgement.
 The ground of the surveys 1, 3, 6 and 7 has 0.07 to 0.19, an even ball has 1."""
+LARGEST_LOOK_DEG = 30.0
+"""Between the cameras' viewing directions, by their mean cosine, and the normal of what they show,
+up to which that plane is taken for the ground, seen squarely. The mean direction of the surveys 1,
+3, 6 and 7, which look down, has 14, 4, 2 and 10; that of the reef clip, which looks ahead, 61."""
 
 
 @dataclass(frozen=True)
@@ -115,3 +124,25 @@ def mean_normal(shown: Sequence[ShownPoints]) -> Array | None:
     if spread[0] > LARGEST_RELIEF**2 * spread[1]:
         return None
     return np.asarray(axes[:, 0])
+
+
+def on_ground(frame: WorldFrame, mapper: Mapper) -> WorldFrame:
+    """The frame of a map with z into the ground and x to the top of the first picture, where
+    gravity is unknown and the views look squarely at the mean plane of what they show; else the
+    frame as it is, and so that of an earlier dive."""
+    if frame.level or frame.site or not mapper.views or not len(mapper.gaussians):
+        return frame
+    down = mean_normal(ShownViews(mapper).points())
+    if down is None:
+        return frame
+    look = np.mean([view.T_wc.R[:, 2] for view in mapper.views], axis=0)
+    down = down * np.sign(down @ look)
+    if down @ look < np.cos(np.radians(LARGEST_LOOK_DEG)):
+        return frame
+    # A survey's lines go there and back, so that only the first picture's top is sure to exist.
+    first = min(mapper.views, key=lambda view: view.frame_index)
+    x = -first.T_wc.R[:, 1]
+    x = x - down * (down @ x)
+    x /= np.linalg.norm(x)
+    R = nearest_rotation(np.array([x, np.cross(down, x), down]))
+    return replace(frame.turn(R @ frame.T_nm.R.T), on_ground=True)
