@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from aquaflow.telemetry.telemetry import Series
@@ -59,19 +61,25 @@ class CameraPath:
         self,
         t_s: Array,  # [M] s, covered
     ) -> tuple[Array, Array]:
-        """Rotations [M, 3, 3] and camera centres [M, 3]; between poses at constant rates."""
+        """Rotations [M, 3, 3], at constant rates between poses, and camera centres [M, 3], on cubic
+        curves: chords of a loop in 4 s with 10 poses a second would make it 0.2 % smaller."""
         t_s = np.clip(t_s, self.t_s[0], self.t_s[-1])
         rotations = Slerp(self.t_s, Rotation.from_matrix(self.R_mc))(t_s).as_matrix()
-        centres = columns_at(t_s, self.t_s, self.p_m)
-        return np.asarray(rotations), centres
+        centres = CubicHermiteSpline(self.t_s, self.p_m, self._slope)(t_s)
+        return np.asarray(rotations), np.asarray(centres)
 
     def velocity(
         self,
         t_s: Array,  # [M] s, covered
     ) -> Array:
         """[M, 3] map units/s."""
-        slope = np.gradient(self.p_m, self.t_s, axis=0)
-        return columns_at(t_s, self.t_s, slope)
+        return columns_at(t_s, self.t_s, self._slope)
+
+    @property
+    def _slope(self) -> Array:
+        """[N, 3] map units/s at the poses."""
+        order: Literal[1, 2] = 2 if len(self) > 2 else 1
+        return np.asarray(np.gradient(self.p_m, self.t_s, axis=0, edge_order=order))
 
 
 # --------------------------------------------------------------------------------------------------

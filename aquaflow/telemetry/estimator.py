@@ -454,7 +454,7 @@ def _alone(problem: TelemetryProblem, factor: Factor) -> _Alone:
     chosen = [f for f in problem.factors if f is factor or f.kind not in SCALING]
     solution = solve(chosen, problem.start, problem.prior)
     noise = solution.noise[next(i for i, f in enumerate(chosen) if f is factor)]
-    sheet = float(np.sqrt(np.mean(factor.sigma**2) + factor.slow.least**2))
+    sheet = float(np.sqrt(np.mean(factor.sigma**2) + factor.slow.least**2 + factor.slow.waves**2))
     variance = float(solution.covariance[SCALE, SCALE][0, 0]) + 0.5 * MAP_SCALE_SIGMA**2
     excess = float(np.hypot(noise.white, noise.size / sheet))
     return _Alone(factor, solution.state.log_scale, variance, excess)

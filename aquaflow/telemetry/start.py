@@ -174,7 +174,7 @@ def level_fit(
 # of the camera's own path pass slowly, and averaging does not remove them. The residuals r [N] of a
 # source are taken as Gaussian with the covariance
 #
-#     white^2 (diag(sigma^2) + least^2 exp(-|dt| / long))
+#     white^2 (diag(sigma^2) + least^2 exp(-|dt| / long) + waves^2 exp(-|dt| / wave) cos(...))
 #         + size^2 exp(-|dt| / time) cos(2 pi dt / period)
 #
 # where sigma and the least slow part are the data sheet's, and what comes on top is the likeliest
@@ -215,6 +215,10 @@ class SlowPart:
     """Its correlation time."""
     processes: tuple[Process, ...]
     """What may come on top."""
+    waves: float = 0.0
+    """1 sigma of waves that are always there, in the residual's unit."""
+    wave: Process = Process(1.0)
+    """Their period, and for how long they keep it."""
 
     def base(
         self,
@@ -223,7 +227,8 @@ class SlowPart:
     ) -> Array:
         """[N, N] covariance by the data sheet."""
         drift = self.least**2 * Process(self.time_s).correlation(t_s)
-        return np.asarray(drift + np.diag(sigma**2))
+        waves = self.waves**2 * self.wave.correlation(t_s)
+        return np.asarray(drift + waves + np.diag(sigma**2))
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ Array = npt.NDArray[np.float64]
 SEEDS = st.integers(0, 2**31)
 STENCIL = 1e-3
 """Of a five-point stencil, whose error is of its fourth power; the factors' own step is 1e-6."""
-EXACT = {"velocity": 2e-4}
-"""m, by which the trapezoidal rule at 50 Hz errs; all else is exact but for rounding."""
+EXACT = {"velocity": 1e-6}
+"""m, by which a spline through 50 samples a second errs; all else is exact but for rounding."""
 
 
 def every(scene: ExactScene) -> list[Factor]:
@@ -131,6 +131,30 @@ def test_the_scale_that_each_displacement_wants_is_the_true_one() -> None:
     misfit, sigma = velocity.scale_misfit(scene.state.move(step))
     np.testing.assert_allclose(misfit, 0.02, rtol=0.05)
     assert (sigma > 0.0).all()
+
+
+@pytest.mark.parametrize("loop_s", [4.0, 1.6])
+def test_a_dvl_of_five_samples_a_second_does_not_cut_the_corners_of_a_loop(loop_s: float) -> None:
+    t = np.arange(0.0, 2.0 * loop_s, 0.1)
+    w = 2.0 * np.pi / loop_s
+    way = 0.6 / w * np.column_stack([np.cos(w * t), np.sin(w * t), 0.3 * np.sin(w * t)])
+    path = CameraPath(t, np.tile(np.eye(3), (len(t), 1, 1)), way)
+    at = np.arange(0.13, t[-1], 0.2)  # between two poses
+    v = 0.6 * np.column_stack([-np.sin(w * at), np.cos(w * at), 0.3 * np.cos(w * at)])
+    dvl = Series("dvl", at, np.column_stack([v, 0.01 + 0.0 * at]))
+    state = MetricState(0.0, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
+    misfit, _ = VelocityFactor(dvl, path).scale_misfit(state)
+    assert np.abs(misfit).max() < 0.01 * (w * 0.2) ** 2  # the trapezoidal rule: 0.08
+
+
+def test_waves_are_felt_near_the_surface_and_not_in_the_deep() -> None:
+    t = np.arange(0.0, 4.0, 0.1)
+    path = CameraPath(t, np.tile(np.eye(3), (len(t), 1, 1)), np.zeros((len(t), 3)))
+    waves = [
+        DepthFactor(Series("bar30", t, np.full((len(t), 1), depth_m)), path).slow.waves
+        for depth_m in (0.0, 10.0, 40.0)
+    ]
+    np.testing.assert_allclose(waves, [0.106, 0.106 * np.exp(-2.515), 0.0], rtol=0.01, atol=1e-4)
 
 
 def test_the_scale_that_each_altitude_wants_is_the_true_one() -> None:
