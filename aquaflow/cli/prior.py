@@ -71,13 +71,16 @@ def oracle(
     range_sigma: Annotated[
         float, typer.Option(min=0.0, max=2.0, help="Relative error of its ranges.")
     ] = 0.05,
+    dense: Annotated[
+        bool, typer.Option("--dense", help="With points and descriptors of every pixel.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Write a prior that knows one dive, to find out what a good prior is worth."""
     from aquaflow.lab.evaluation.oracle_views import make_oracle
 
     with progress_bars(as_json) as advance:
-        count = make_oracle(recording, out, range_sigma, advance, dive)
+        count = make_oracle(recording, out, range_sigma, advance, dive, dense)
     typer.echo(json.dumps({"pictures": count}) if as_json else f"{count} pictures, {out}")
 
 

@@ -52,7 +52,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
     },
     "paper-strict": {
-        "prior": {"kind": "compact"},
+        "prior": {"kind": "compact", "matches": "network"},
         "tracking": {
             "residual": "point", "judge_hidden": False, "return_candidates": 0,
             "crowd_share": 0.7, "recent_keyframes": 0, "reuse_encodings": False,

@@ -388,6 +388,11 @@ class PriorConfig(StageConfig):
         True,
         description="flow starts at the network's matches; False: at keypoints', as without one",
     )
+    matches: Lab[Literal["flow", "network"]] = Field(
+        "flow",
+        description="network: those of its points and descriptors, as published, if it gives them "
+        "for all pixels, as mast3r does; else flow's, with a warning. flow: which starts there",
+    )
     device: Literal["auto", "cpu", "cuda", "tensorrt"] = Field(
         "auto", description="auto: the fastest that onnxruntime has; any other is that or an error"
     )

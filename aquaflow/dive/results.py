@@ -170,6 +170,7 @@ def metrics(
         if renderer is None
         else f"{renderer.name} ({renderer.isa}, {renderer.threads} threads)",
         "prior": slam.prior.name,
+        "matching": slam.prior.matching,
         "device": None if renderer is None else renderer.device.type,
         "transfers": transfers(),
         "seed": slam.config.seed,

@@ -41,6 +41,7 @@ class _OwnMatcher(threading.local):
 class FlowPrior:
     """Flow from the likeliest start; without ranges, unless a prior says otherwise."""
 
+    matching: str = "flow from SIFT"
     ranged: bool = False
     metric: bool = False
     unit_sigma: float = float("inf")

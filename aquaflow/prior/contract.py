@@ -130,6 +130,8 @@ class Prior(Protocol):
     """A two-view prior; a live run calls it from two threads."""
 
     name: str
+    matching: str
+    """What its matches are where none are expected, for metrics.json."""
     ranged: bool
     """True if it knows pointmaps (X, Q) of single pictures or still cameras."""
     metric: bool

@@ -18,7 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float
 from aquaflow.prior.folder import CARD, NETWORK, UNITS, DepthCard, read_card
-from aquaflow.prior.network import METRIC_SIGMA, Half, LearnedRange, cell_rays
+from aquaflow.prior.network import METRIC_SIGMA, Described, Half, LearnedRange, cell_rays
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 FARTHEST = 0.1
@@ -31,7 +31,7 @@ NEARLY_ALL = (5.0, 95.0)
 class DepthDescriber:
     """A network that says how deep each pixel of one picture is."""
 
-    describes = False
+    describes: Described = "nothing"
 
     def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
         """Load the network of ``folder``.
@@ -159,6 +159,9 @@ class DepthPair:
     @property
     def cells(self) -> None:
         return None
+
+    def dense(self, back: bool = False) -> None:
+        """It gives none of all pixels."""
 
     @property
     def confidence(self) -> None:

@@ -15,7 +15,16 @@ from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.depth_describer import DepthDescriber, as_input, multiple_of, resize
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
 from aquaflow.prior.mast3r_describer import Mast3rDescriber
-from aquaflow.prior.network import MOST_LOG, Describer, Half, LearnedRange, Picture, cell_rays, unit
+from aquaflow.prior.network import (
+    MOST_LOG,
+    Described,
+    Describer,
+    Half,
+    LearnedRange,
+    Picture,
+    cell_rays,
+    unit,
+)
 from aquaflow.prior.oracle import OracleDescriber
 from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings
 
@@ -26,7 +35,8 @@ MULTIPLE_PX = 16
 class CompactDescriber:
     """The compact network: descriptors of a picture's cells, whatever the other picture is."""
 
-    metric, describes = False, True
+    metric = False
+    describes: Described = "cells"
     range_unit: RangeUnit = "shared"
     unit_sigma = float("inf")
     """It was trained on pairs whose scale was taken out: where the scene is twice as far, its range
@@ -116,6 +126,9 @@ class CompactPair:
     @property
     def cells(self) -> tuple[Float, Float]:
         return self.a.astype(np.float32), self.b.astype(np.float32)
+
+    def dense(self, back: bool = False) -> None:
+        """It gives none of all pixels."""
 
     @property
     def range_a(self) -> LearnedRange:

@@ -62,7 +62,11 @@ def _choose(config: PriorConfig) -> Prior:
     settings = RuntimeSettings(
         config.device, config.precision, min(config.threads, core_count()), config.engine_cache
     )
-    return HybridPrior(describer_in(folder, settings), config.learned_matches)
+    describer = describer_in(folder, settings)
+    own_matches = config.matches == "network"
+    if own_matches and describer.describes != "pixels":
+        log.warning("matches are flow's: %s gives no descriptors of all pixels", describer.name)
+    return HybridPrior(describer, config.learned_matches, own_matches)
 
 
 def keypoint_network(kind: NetworkKind, device: str) -> KeypointNetwork:
@@ -115,7 +119,7 @@ class UnweightedPrior:
     def __init__(self, prior: Prior) -> None:
         self._prior = prior
         self.name, self.ranged, self.metric = prior.name, prior.ranged, prior.metric
-        self.unit_sigma = prior.unit_sigma
+        self.matching, self.unit_sigma = prior.matching, prior.unit_sigma
 
     def encode(
         self,

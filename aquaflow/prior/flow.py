@@ -34,7 +34,7 @@ its depth is too small; depths that are handed over must come back to within thi
 not, scale drifts four times as fast (synthetic survey, 20 keyframes: -1 against -5 % per 100)."""
 
 CONFIDENCE_SIGMA_PX = 0.2
-"""Forward-backward error at which a match's confidence has fallen to exp(-1/2)."""
+"""Of the forward-backward error of refined flow."""
 
 EDGE_WINDOW_PX = 7
 """Half of a refined match's window to either side: an edge of the depth within it is in the match,
@@ -72,6 +72,8 @@ class ImageFlow:
     """[H, W] px, forward-backward."""
     valid: npt.NDArray[np.bool_]
     """[H, W]"""
+    sigma_px: float = CONFIDENCE_SIGMA_PX
+    """Error at which the confidence of a match has fallen to exp(-1/2)."""
 
     @property
     def share(self) -> float:
@@ -128,12 +130,8 @@ def confidence(
     window = (EDGE_WINDOW_PX, EDGE_WINDOW_PX)
     # In OpenCV's vectors, and no [H, W, 2] in NumPy: half the time.
     size = cv2.magnitude(*cv2.split(flow.forward - cv2.blur(flow.forward, window)))
-    edge = cv2.dilate(size, np.ones(window, np.uint8)) * np.float32(
-        EDGE_WEIGHT / CONFIDENCE_SIGMA_PX
-    )
-    certain = np.asarray(
-        cv2.exp(flow.error * flow.error * np.float32(-0.5 / CONFIDENCE_SIGMA_PX**2))
-    )
+    edge = cv2.dilate(size, np.ones(window, np.uint8)) * np.float32(EDGE_WEIGHT / flow.sigma_px)
+    certain = np.asarray(cv2.exp(flow.error * flow.error * np.float32(-0.5 / flow.sigma_px**2)))
     return np.asarray(certain * flow.valid / (1.0 + edge * edge), dtype=np.float32)
 
 

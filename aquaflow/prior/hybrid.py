@@ -9,7 +9,7 @@ what is near its start. So flow starts at the descriptors' matches
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,8 +21,16 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.classical import WARM_UP, FlowPrior, classical_starts
 from aquaflow.prior.contract import Encoding, Float, Mask, RangeUnit
+from aquaflow.prior.dense_matching import matches_both_ways
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair, from_homography, from_prediction
-from aquaflow.prior.network import ComparedPair, Describer, Half, Picture, spread_over
+from aquaflow.prior.network import (
+    ComparedPair,
+    Described,
+    Describer,
+    Half,
+    Picture,
+    spread_over,
+)
 
 
 @dataclass
@@ -124,17 +132,35 @@ class HybridPair(FlowPair):
         return self._in_b[1]
 
 
+MATCHING: dict[Described, str] = {
+    "nothing": FlowPrior.matching,
+    "cells": "flow from descriptors of cells",
+    "pixels": "flow from points and descriptors of pixels",
+}
+"""By what the network describes."""
+OWN_MATCHES = "points and descriptors of pixels, without flow"
+NEAR_SHARE = 0.1
+"""Of the width: distance from a prediction that stands alone up to which a match counts."""
+
+
 class HybridPrior(FlowPrior):
     """Flow that starts from learned matches, behind the prior contract."""
 
     ranged = True
 
-    def __init__(self, describer: Describer, learned_matches: bool = True) -> None:
-        """Without ``learned_matches`` flow starts at keypoints where a prediction fails."""
+    def __init__(
+        self, describer: Describer, learned_matches: bool = True, own_matches: bool = False
+    ) -> None:
+        """Without ``learned_matches`` flow starts at keypoints where a prediction fails; with
+        ``own_matches`` it is not asked where the network gives points and descriptors of pixels."""
         super().__init__()
         self.name, self.metric = describer.name, describer.metric
         self.unit_sigma = describer.unit_sigma
         self._learned_matches = learned_matches
+        self.matching = MATCHING[describer.describes if learned_matches else "nothing"]
+        self._own_matches = own_matches and describer.describes == "pixels"
+        if self._own_matches:
+            self.matching = OWN_MATCHES
         self._describer = describer
 
     def encode(
@@ -172,6 +198,10 @@ class HybridPrior(FlowPrior):
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
         comparison = LazyComparison(a, b)
+        if self._own_matches:
+            own = own_matches(comparison.found, a.grey.shape, predicted if alone else None)
+            if own is not None:
+                return HybridPair(a, b, own, comparison)
         starts = _starts(a, b, predicted, comparison if self._learned_matches else None)
         return HybridPair(a, b, self._flow(a, b, predicted, alone, starts), comparison)
 
@@ -190,16 +220,41 @@ def _starts(
     predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
     comparison: LazyComparison | None,
 ) -> Iterator[Float | None]:
-    if not a.describer.describes:
+    if a.describer.describes == "nothing":
         yield from classical_starts(a, b, predicted)
         return
     yield from from_prediction(predicted)
-    cells = None if comparison is None else comparison.found.cells
-    flow = None if cells is None else coarse_flow(*cells, *a.grey.shape)
+    flow = None if comparison is None else learned_flow(comparison.found, *a.grey.shape)
     if flow is not None:
         yield flow
     yield from from_homography(a, b)
     yield None
+
+
+def learned_flow(found: ComparedPair, height: int, width: int) -> Float | None:
+    """[height, width, 2] px from a to b: of all pixels where the network gives points and
+    descriptors of them, else of cells; None where it gives no matches, or too few agree."""
+    views = found.dense()
+    if views is not None:
+        return views.flow(height, width)
+    return None if found.cells is None else coarse_flow(*found.cells, height, width)
+
+
+def own_matches(
+    found: ComparedPair,
+    size: tuple[int, ...],  # height and width, px
+    near: Float | None,  # [height, width, 2] px, matches near which alone others count
+) -> dense.ImageFlow | None:
+    """The network's matches of all pixels, as published; None of a pair that it does not know."""
+    there, back = found.dense(), found.dense(back=True)
+    if there is None or back is None:
+        return None
+    height, width = size
+    flow = matches_both_ways(there, back, height, width)
+    if near is None:
+        return flow
+    off = dense.length(dense.pixel_grid(height, width) + flow.forward - near)
+    return replace(flow, valid=flow.valid & (off < NEAR_SHARE * width))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -16,9 +16,18 @@ import numpy as np
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.prior.dense_matching import DenseViews
 from aquaflow.prior.depth_describer import ImagePadding, as_input
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.network import METRIC_SIGMA, SHORTEST, Half, LearnedRange, Picture
+from aquaflow.prior.network import (
+    METRIC_SIGMA,
+    SHORTEST,
+    Described,
+    Half,
+    LearnedRange,
+    Picture,
+    unit,
+)
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 CELL_PX = 8
@@ -34,7 +43,8 @@ POINTS_ALPHA = 0.2
 class Mast3rDescriber:
     """The paper's network: descriptors of both pictures, after each has looked at the other."""
 
-    metric, describes = True, True
+    metric = True
+    describes: Described = "pixels"
     unit_sigma = METRIC_SIGMA
     range_unit: RangeUnit = "shared"
 
@@ -42,6 +52,7 @@ class Mast3rDescriber:
         """Load the exported ``folder``; raises as the compact one."""
         card = read_card(folder)
         self.name, self._size = card.name, (card.height, card.width)
+        self.threads = settings.threads
         self._encoder = NetworkSession(folder / ENCODER, settings)
         self._decoder = NetworkSession(folder / DECODER, settings)
 
@@ -99,23 +110,38 @@ class Mast3rPair:
     @property
     def cells(self) -> tuple[Float, Float]:
         """[h / 8, w / 8, d] the descriptors at the cells' centres."""
-        found = self._decoded
-        return _at_cells(found["D_a"], self.framing_a), _at_cells(found["D_b"], self.framing_b)
+        found = self._decoded_back
+        return _at_cells(found["D_b"], self.framing_a), _at_cells(found["D_a"], self.framing_b)
+
+    def dense(self, back: bool = False) -> DenseViews:
+        """To match a in b from the pair the other way round: that has the points of both in b's own
+        frame, whose rays are searched."""
+        found = self._decoded if back else self._decoded_back
+        sought, searched = self.framing_a, self.framing_b
+        if back:
+            sought, searched = searched, sought
+        return DenseViews(
+            sought.cut(found["X_b"][0]),
+            searched.cut(found["X_a"][0]),
+            unit(sought.cut(found["D_b"][0])),
+            unit(searched.cut(found["D_a"][0])),
+            self.describer.threads,
+        )
 
     @property
     def range_a(self) -> LearnedRange:
         return _range_of_points(self._decoded, self.framing_a)
 
-    @cached_property
+    @property
     def range_b(self) -> LearnedRange:
         """From the pair the other way round: that has its points in b's own frame."""
-        return _range_of_points(self.describer.decode(self.b, self.a), self.framing_b)
+        return _range_of_points(self._decoded_back, self.framing_b)
 
     @cached_property
     def confidence(self) -> Float:
         """C of the descriptors weighed matching errors in training, up to a factor without meaning:
         what is as sure as the picture's median or surer keeps its weight."""
-        C = _at_cells(self._decoded["C_a"], self.framing_a)
+        C = _at_cells(self._decoded_back["C_b"], self.framing_a)
         sound = np.isfinite(C)
         if not sound.any():
             return np.ones_like(C)
@@ -125,6 +151,10 @@ class Mast3rPair:
     @cached_property
     def _decoded(self) -> Mapping[str, Float]:
         return self.describer.decode(self.a, self.b)
+
+    @cached_property
+    def _decoded_back(self) -> Mapping[str, Float]:
+        return self.describer.decode(self.b, self.a)
 
 
 def _at_cells(

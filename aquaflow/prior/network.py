@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -11,9 +11,14 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, Mask, RangeUnit
+from aquaflow.prior.dense_matching import DenseViews
 
 Picture = npt.NDArray[np.uint8]
 Half = npt.NDArray[np.float16]
+
+Described: TypeAlias = Literal["nothing", "cells", "pixels"]
+"""What of a picture a network gives descriptors of: nothing (it knows ranges only), cells, or all
+pixels, with their points in the other picture's frame."""
 
 METRIC_SIGMA = 0.1
 """Relative error of the metre of a metric network; assumed, none was run here with real weights."""
@@ -28,6 +33,11 @@ class ComparedPair(Protocol):
     def cells(self) -> tuple[Float, Float] | None:
         """[rows, columns, d] unit descriptors of cells that cover each picture; None of a network
         that only knows ranges."""
+        ...
+
+    def dense(self, back: bool = False) -> DenseViews | None:
+        """Points and descriptors of all pixels, to match the first picture in the second, or
+        ``back``; None of a network that does not give them, or not of this pair."""
         ...
 
     @property
@@ -51,8 +61,7 @@ class Describer(Protocol):
 
     name: str
     metric: bool
-    describes: bool
-    """False: it knows ranges only."""
+    describes: Described
     range_unit: RangeUnit
     unit_sigma: float
     """As of the prior."""

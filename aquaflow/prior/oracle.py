@@ -10,20 +10,26 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.prior.dense_matching import DenseViews
+from aquaflow.prior.dense_oracle import DenseOracle
 from aquaflow.prior.folder import PriorCard, read_card, sha256_of, write_card
-from aquaflow.prior.network import Half, LearnedRange, Picture
+from aquaflow.prior.network import Described, Half, LearnedRange, Picture
 
 TRUTH = "truth.npz"
 """File of the folder: pictures by their checksum, and what each cell shows."""
 MOST_CELLS = 2100
 """Of a picture: as many as its descriptors are compared with in a blink."""
+PAGE = 1024
+"""A picture's number is kept as that of its page and its place there: half floats hold both."""
 FEATURES = 64
 """Numbers of a descriptor."""
 WIDTH_CELLS = 1.5
@@ -43,6 +49,8 @@ class TrueView:
     """[H, W, 3] in one frame of the whole dive; NaN where nothing is known"""
     ranges: npt.NDArray[np.float64]
     """[H, W] along the pixel's ray, in the unit of ``points``; NaN where nothing is known"""
+    T_wc: Sim3
+    """Of the camera, in the frame of ``points``"""
 
 
 def write_oracle(
@@ -51,8 +59,10 @@ def write_oracle(
     camera: CameraModel,
     range_sigma: float,
     seed: int = 0,
+    dense: bool = False,
 ) -> PriorCard:
-    """An oracle of these pictures; ranges get a relative error of ``range_sigma``, by cells.
+    """An oracle of these pictures; ranges get a relative error of ``range_sigma``, by cells. A
+    ``dense`` one has points and descriptors of all pixels, too (aquaflow/prior/dense_oracle.py).
 
     Raises:
         InputError: there is no picture, or ``folder`` holds something.
@@ -68,14 +78,16 @@ def write_oracle(
     points = np.stack([points for points, _ in found]).astype(np.float32)
     log_range = np.log(np.stack([ranges for _, ranges in found]))
     log_range = log_range + range_sigma * rng.normal(size=log_range.shape)
-    cell = float(np.nanmedian(np.exp(log_range))) * cell_px / camera.fx
+    pixel = float(np.nanmedian(np.exp(log_range))) / camera.fx
     np.savez(
         folder / TRUTH,
         pictures=np.array([_checksum(view.picture) for view in views]),
         points=points,
         log_range=log_range.astype(np.float32),
-        width=np.float64(WIDTH_CELLS * cell),
+        pixel=np.float64(pixel),
+        width=np.float64(WIDTH_CELLS * cell_px * pixel),
         range_sigma=np.float64(range_sigma),
+        **(_all_pixels(views) if dense else {}),
     )
     card = PriorCard(
         name="oracle",
@@ -92,10 +104,18 @@ def write_oracle(
     return card
 
 
+def _all_pixels(views: list[TrueView]) -> dict[str, Any]:
+    return {
+        "all_points": np.stack([view.points for view in views]).astype(np.float32),
+        "R_wc": np.stack([view.T_wc.R for view in views]),
+        "centres": np.stack([view.T_wc.t for view in views]),
+    }
+
+
 class OracleDescriber:
     """Looks pictures up; of one that it does not know, it says nothing."""
 
-    name, metric, describes = "oracle", False, True
+    name, metric = "oracle", False
     range_unit: RangeUnit = "shared"
     unit_sigma = 0.0
     """Its unit is the same in all pictures."""
@@ -113,10 +133,12 @@ class OracleDescriber:
             pictures, self._points = found["pictures"], found["points"]
             self._log_range, self._width = found["log_range"], float(found["width"])
             self._variance = float(found["range_sigma"]) ** 2
+            self._dense = _dense_oracle(found) if "all_points" in found else None
         except (KeyError, ValueError, OSError) as error:
             raise InputError(
                 f"{folder / TRUTH} cannot be read ({reason_of(error)}); write the oracle again"
             ) from error
+        self.describes: Described = "cells" if self._dense is None else "pixels"
         self._index = {str(name): number for number, name in enumerate(pictures)}
         rng = np.random.default_rng(SEED)
         self._directions = rng.normal(size=(3, FEATURES // 2)) / self._width
@@ -133,57 +155,85 @@ class OracleDescriber:
         self,
         picture: Picture,  # [H, W, 3]
     ) -> Half:
-        """[h, w, FEATURES + 1] the descriptors, 0 where nothing is known, and the log of range."""
+        """[2] the picture's number; NaN of one that is not known."""
         number = self._index.get(_checksum(picture))
-        if number is None:
-            return np.full((*self._points.shape[1:3], FEATURES + 1), np.nan, np.float16)
-        phase = self._points[number] @ self._directions + self._phases
-        waves = np.concatenate([np.cos(phase), np.sin(phase)], -1) * (2.0 / FEATURES) ** 0.5
-        return np.concatenate([waves, self._log_range[number][..., None]], -1).astype(np.float16)
+        found = (np.nan, np.nan) if number is None else divmod(number, PAGE)
+        return np.array(found, np.float16)
 
     def compare(
         self,
-        a: Half,  # [h, w, FEATURES + 1]
-        b: Half,  # [h, w, FEATURES + 1]
+        a: Half,  # [2]
+        b: Half,  # [2]
         camera_a: CameraModel,
         camera_b: CameraModel,
     ) -> OraclePair:
         """What is known of both."""
-        return OraclePair(a.astype(np.float32), b.astype(np.float32), self._variance)
+        return OraclePair(self, _number(a), _number(b))
+
+    def descriptors(self, number: int | None) -> Float:
+        """[h, w, FEATURES] of the cells of a picture; 0 where nothing is known."""
+        if number is None:
+            return np.zeros((*self._points.shape[1:3], FEATURES), np.float32)
+        phase = self._points[number] @ self._directions + self._phases
+        waves = np.concatenate([np.cos(phase), np.sin(phase)], -1) * (2.0 / FEATURES) ** 0.5
+        return np.asarray(np.nan_to_num(waves), dtype=np.float32)
+
+    def learned_range(self, number: int | None) -> LearnedRange:
+        """Of the cells of a picture."""
+        shape = self._points.shape[1:3]
+        log_range = np.full(shape, np.nan) if number is None else self._log_range[number]
+        variance = np.full(shape, max(self._variance, 1e-6), np.float32)
+        return LearnedRange(log_range.astype(np.float32), variance)
+
+    def views(self, a: int | None, b: int | None) -> DenseViews | None:
+        """Of all pixels of two pictures; None of an oracle that does not know them."""
+        return None if self._dense is None or a is None or b is None else self._dense.views(a, b)
 
 
 @dataclass(frozen=True)
 class OraclePair:
     """Two pictures that were looked up."""
 
-    a: Float
-    """[h, w, FEATURES + 1]"""
-    b: Float
-    """[h, w, FEATURES + 1]"""
-    variance: float
+    describer: OracleDescriber
+    a: int | None
+    b: int | None
+    """Their numbers; None of a picture that is not known."""
 
     @property
     def cells(self) -> tuple[Float, Float]:
-        return np.nan_to_num(self.a[..., :FEATURES]), np.nan_to_num(self.b[..., :FEATURES])
+        return self.describer.descriptors(self.a), self.describer.descriptors(self.b)
+
+    def dense(self, back: bool = False) -> DenseViews | None:
+        """What a dense one knows of both pictures."""
+        a, b = (self.b, self.a) if back else (self.a, self.b)
+        return self.describer.views(a, b)
 
     @property
     def range_a(self) -> LearnedRange:
-        return self._range(self.a)
+        return self.describer.learned_range(self.a)
 
     @property
     def range_b(self) -> LearnedRange:
-        return self._range(self.b)
+        return self.describer.learned_range(self.b)
 
     @property
     def confidence(self) -> Float | None:
         return None
 
-    def _range(
-        self,
-        found: Float,  # [h, w, FEATURES + 1]
-    ) -> LearnedRange:
-        log_range = found[..., FEATURES]
-        return LearnedRange(log_range, np.full_like(log_range, max(self.variance, 1e-6)))
+
+def _number(
+    features: Half,  # [2]
+) -> int | None:
+    page, place = features
+    return None if np.isnan(page) else PAGE * int(page) + int(place)
+
+
+def _dense_oracle(
+    found: dict[str, npt.NDArray[np.float32]],  # of TRUTH
+) -> DenseOracle:
+    poses = [Sim3(R, t) for R, t in zip(found["R_wc"], found["centres"], strict=True)]
+    sigma, pixel = float(found["range_sigma"]), float(found["pixel"])
+    return DenseOracle(found["all_points"], poses, sigma, pixel)
 
 
 def _cell_px(camera: CameraModel) -> int:

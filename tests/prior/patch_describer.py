@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import RangeUnit
+from aquaflow.prior.dense_matching import DenseViews
 from aquaflow.prior.mast3r_describer import CELL_PX
 from aquaflow.prior.network import LearnedRange, unit
 
@@ -21,7 +22,7 @@ class PatchDescriber:
     """Describes a cell by the grey values around it, smoothed; counts how often it is asked."""
 
     name = "patches"
-    metric, describes = False, True
+    metric, describes = False, "cells"
     range_unit: RangeUnit = "shared"
     unit_sigma = 0.2
 
@@ -58,7 +59,12 @@ class PatchPair:
     """Three units everywhere, known to 30 %."""
 
     cells: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+    views: tuple[DenseViews, DenseViews] | None = None
+    """There and back."""
     confidence = None
+
+    def dense(self, back: bool = False) -> DenseViews | None:
+        return None if self.views is None else self.views[back]
 
     @property
     def range_a(self) -> LearnedRange:

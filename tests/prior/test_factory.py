@@ -29,6 +29,17 @@ def test_without_weights_the_safety_net_tracks_and_says_so(
     assert f"there are no weights in {tmp_path}" in record.message
 
 
+def test_matches_that_the_network_cannot_give_are_flows_and_that_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
+    folder = write_stub(tmp_path / "prior")
+    with caplog.at_level(logging.WARNING):
+        prior = make_prior(PriorConfig(kind="folder", folder=folder, matches="network"))
+    assert prior.matching == "flow from descriptors of cells"
+    assert "compact gives no descriptors of all pixels" in caplog.text
+
+
 def test_without_onnxruntime_the_safety_net_tracks_and_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -12,8 +12,9 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior import homography
 from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.dense_matching import DenseViews
 from aquaflow.prior.hybrid import HybridEncoding, HybridPrior
-from tests.prior.patch_describer import PatchDescriber
+from tests.prior.patch_describer import PatchDescriber, PatchPair
 from tests.prior.textured_pictures import (
     CAMERA,
     FAR,
@@ -33,6 +34,21 @@ class Mute(PatchDescriber):
         return np.full((HEIGHT // 8, WIDTH // 8, 4), 0.5, np.float16)
 
 
+class Pixels(Mute):
+    """Cells tell it nothing, but it knows the points of all pixels of pictures shifted by FAR."""
+
+    describes = "pixels"
+
+    def compare(self, *_: object) -> PatchPair:  # type: ignore[override]
+        there, here, back = (
+            CAMERA.unproject(pixel_centres() + by).astype(np.float32)
+            for by in (np.array(FAR), np.zeros(2), -np.array(FAR))
+        )
+        same = np.full((HEIGHT, WIDTH, 4), 0.5, np.float32)
+        views = DenseViews(there, here, same, same), DenseViews(back, here, same, same)
+        return PatchPair((same[::8, ::8], same[::8, ::8]), views)
+
+
 def encoded(prior: HybridPrior, pictures: tuple[Picture, Picture]) -> tuple[HybridEncoding, ...]:
     return tuple(prior.encode(picture, CAMERA) for picture in pictures)
 
@@ -44,6 +60,40 @@ def test_descriptors_find_what_moved_too_far_for_flow() -> None:
     assert pair.valid.mean() > 0.5
     error = np.linalg.norm(pair.matches - pixel_centres() - FAR, axis=-1)
     assert np.median(error[pair.valid]) < 0.1
+
+
+@pytest.mark.usefixtures("no_sift")
+def test_points_of_all_pixels_are_matched_where_a_network_gives_them() -> None:
+    prior = HybridPrior(Pixels())
+    pair = prior.decode(*encoded(prior, moved_pair(shift(*FAR))))
+    assert pair.valid.mean() > 0.5
+    error = np.linalg.norm(pair.matches - pixel_centres() - FAR, axis=-1)
+    assert np.median(error[pair.valid]) < 0.1
+
+
+def test_matches_of_the_networks_own_need_no_texture_and_no_flow() -> None:
+    prior = HybridPrior(Pixels(), own_matches=True)
+    bare = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    pair = prior.decode(*encoded(prior, (bare, bare)))
+    there = pixel_centres() + FAR
+    seen = ((there > 3.0) & (there < [WIDTH - 3.0, HEIGHT - 3.0])).all(-1)
+    assert pair.valid[seen].all()
+    assert np.abs(pair.matches - there)[seen].max() < 0.02
+    assert (pair.C[seen] > 0.5).mean() > 0.9
+    assert pair.valid_back.any()
+    elsewhere = pixel_centres().astype(np.float32)
+    alone = prior.decode(*encoded(prior, (bare, bare)), elsewhere, alone=True)
+    assert not alone.valid.any()
+
+
+def test_how_it_matches_is_said_and_follows_what_the_network_describes() -> None:
+    assert HybridPrior(Pixels()).matching == "flow from points and descriptors of pixels"
+    assert HybridPrior(PatchDescriber()).matching == "flow from descriptors of cells"
+    own = "points and descriptors of pixels, without flow"
+    assert HybridPrior(Pixels(), own_matches=True).matching == own
+    assert HybridPrior(PatchDescriber(), own_matches=True).matching != own
+    without = HybridPrior(Pixels(), learned_matches=False)
+    assert without.matching == ClassicalPrior().matching == "flow from SIFT"
 
 
 @pytest.mark.usefixtures("no_sift")

@@ -64,9 +64,21 @@ def test_cells_ranges_and_confidence_are_those_of_the_picture_alone(
 def test_cells_lie_where_the_picture_is_in_the_frame(describer: Mast3rDescriber) -> None:
     pair = compared(describer)
     tokens = [describer.features(describer.fit(picture)) for picture in pictures()]
-    D = describer.decode(*tokens)["D_a"][0]
+    D = describer.decode(*tokens[::-1])["D_b"][0]
     band = (FRAME[0] - CELLS[0] * CELL_PX) // 2 // CELL_PX * CELL_PX
     np.testing.assert_array_equal(pair.cells[0][0, 0], D[band + CELL_PX // 2, CELL_PX // 2])
+
+
+def test_points_and_descriptors_are_those_of_all_pixels_of_the_picture(
+    describer: Mast3rDescriber,
+) -> None:
+    pair = compared(describer)
+    size = (CELLS[0] * CELL_PX, CELLS[1] * CELL_PX)
+    for found in (pair.dense(), pair.dense(back=True)):
+        assert found.points_a.shape == found.points_b.shape == (*size, 3)
+        for descriptors in (found.descriptors_a, found.descriptors_b):
+            assert descriptors.shape == (*size, TINY.descriptor)
+            np.testing.assert_allclose(np.linalg.norm(descriptors, axis=-1), 1.0, rtol=1e-5)
 
 
 def test_each_way_is_decoded_once(
@@ -77,7 +89,14 @@ def test_each_way_is_decoded_once(
     monkeypatch.setattr(describer, "decode", lambda *ab: asked.append(1) or decoded(*ab))
     pair = compared(describer)
     for _ in range(2):
-        _ = pair.cells, pair.range_a, pair.range_b, pair.confidence
+        _ = (
+            pair.cells,
+            pair.dense(),
+            pair.dense(back=True),
+            pair.range_a,
+            pair.range_b,
+            pair.confidence,
+        )
     assert len(asked) == 2
 
 
@@ -91,13 +110,13 @@ def test_half_of_the_cells_keep_their_weight_and_none_gains(describer: Mast3rDes
 def test_confidence_that_is_no_number_takes_no_weight(
     bad: float, describer: Mast3rDescriber, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = {"C_a": np.full((1, *FRAME), 2.0, np.float32)}
-    found["C_a"][0, 20:30] = bad
-    found["C_a"][0, :, 44:] = 0.5
+    found = {"C_b": np.full((1, *FRAME), 2.0, np.float32)}
+    found["C_b"][0, 20:30] = bad
+    found["C_b"][0, :, 44:] = 0.5
     monkeypatch.setattr(describer, "decode", lambda a, b: found)
     confidence = compared(describer).confidence
     assert set(np.unique(confidence)) == {0.25, 1.0}
-    found["C_a"][:] = bad
+    found["C_b"][:] = bad
     assert (compared(describer).confidence == 1.0).all()
 
 

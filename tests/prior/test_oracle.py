@@ -10,7 +10,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.config import PriorConfig
 from aquaflow.prior.factory import make_prior
-from aquaflow.prior.oracle import TRUTH, TrueView, write_oracle
+from aquaflow.prior.oracle import TRUTH, OracleDescriber, TrueView, write_oracle
 from aquaflow.tracking.learned import unscaled_depth
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path
 
@@ -24,7 +24,7 @@ def views() -> list[TrueView]:
         rays = CAMERA.unproject(CAMERA.pixel_centres())
         in_camera = rays * floor.depth(T_wc)[..., None]
         ranges = np.linalg.norm(in_camera, axis=-1)
-        found.append(TrueView(floor.picture(T_wc), T_wc.apply(in_camera), ranges))
+        found.append(TrueView(floor.picture(T_wc), T_wc.apply(in_camera), ranges, T_wc))
     return found
 
 
@@ -55,6 +55,26 @@ def test_it_finds_matches_and_ranges_of_the_pictures_it_knows(
         assert Q is not None
         np.testing.assert_allclose(Q, 0.05**-2, rtol=1e-3)
         assert unscaled_depth(CAMERA, X, Q) is not None
+
+
+def test_a_dense_one_knows_points_and_descriptors_of_all_pixels(
+    views: list[TrueView], tmp_path: Path
+) -> None:
+    out = tmp_path / "prior"
+    write_oracle(out, views, CAMERA, range_sigma=0.05, dense=True)
+    oracle = OracleDescriber(out)
+    assert oracle.describes == "pixels"
+    pair = oracle.compare(*(oracle.features(view.picture) for view in views), CAMERA, CAMERA)
+    there = pair.dense()
+    assert there is not None
+    moved = there.flow(CAMERA.height, CAMERA.width)
+    T_ba = POSES[1].inverse() @ POSES[0]
+    pixels = CAMERA.pixel_centres()
+    truth = CAMERA.project(
+        T_ba.apply(CAMERA.unproject(pixels) * SeaFloor().depth(POSES[0])[..., None])
+    )
+    seen = ((truth > 0.0) & (truth < [CAMERA.width, CAMERA.height])).all(-1)
+    assert np.median(np.linalg.norm(pixels + moved - truth, axis=-1)[seen]) < 2.0
 
 
 def test_of_other_pictures_it_knows_nothing(folder: Path) -> None:

@@ -103,7 +103,7 @@ def _seen(view: KnownView, T: Sim3, camera: CameraModel) -> tuple[npt.NDArray[np
 class KnownPrior:
     """A prior that is told the truth through the frames' indices."""
 
-    name, ranged, metric, unit_sigma = "known", False, False, np.inf
+    name, matching, ranged, metric, unit_sigma = "known", "true", False, False, np.inf
 
     def __init__(self, views: list[KnownView], true: CameraModel, noise_px: float = 0.1) -> None:
         self.views, self.true, self.noise_px = views, true, noise_px

@@ -35,9 +35,10 @@ def make_oracle(
     range_sigma: float,
     progress: Progress,
     dive: Path | None = None,
+    dense: bool = False,
 ) -> int:
     """Write an oracle of the pictures of ``recording``: a synthetic dive, or one that ``dive``
-    mapped; returns how many pictures it knows.
+    mapped; ``dense``: of all their pixels. Returns how many pictures it knows.
 
     Raises:
         InputError: there is no truth, or it does not fit the recording.
@@ -48,7 +49,7 @@ def make_oracle(
         progress("views", len(found), None)
     if not found:
         raise InputError(f"{recording} has no picture with a true range; give a dive that has them")
-    write_oracle(out, [view for view, _ in found], found[0][1], range_sigma)
+    write_oracle(out, [view for view, _ in found], found[0][1], range_sigma, dense=dense)
     return len(found)
 
 
@@ -107,4 +108,5 @@ def _view(
     distance = np.asarray(np.where(known, at, np.nan), dtype=np.float64)
     rays = camera.unproject(camera.pixel_centres())
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    return TrueView(frame.image, T_wc.apply(rays * distance[..., None]), distance), camera
+    points = T_wc.apply(rays * distance[..., None])
+    return TrueView(frame.image, points, distance, T_wc), camera

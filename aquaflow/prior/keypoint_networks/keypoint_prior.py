@@ -74,6 +74,8 @@ class KeypointPrior(FlowPrior):
         """Without ``learned_matches`` flow starts at SIFT's where a prediction fails."""
         super().__init__()
         self.name, self._learned_matches = network.name, learned_matches
+        if learned_matches:
+            self.matching = f"flow from {network.name}"
         self._network = network
 
     def encode(

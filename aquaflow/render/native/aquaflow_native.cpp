@@ -20,6 +20,7 @@
 #include "fuse_depths.h"
 #include "fuse_ranges.h"
 #include "image_formation.h"
+#include "match_points.h"
 #include "photometric.h"
 #include "pool.h"
 #include "pose_equations.h"
@@ -253,6 +254,20 @@ AQ_EXPORT int aq_check_flow(const float* forward, const float* backward, const f
   check_flow({forward, backward, texture_a, texture_b, border_px, most_error_px, least_texture},
              {width, height}, error, valid);
   return 0;
+}
+
+// See match_points.h: pixels [count, 2] whose rays are nearest to the wanted ones.
+AQ_EXPORT int aq_project_rays(const ProjectRays* in, int threads) {
+  return guarded([&] {
+    for_each_match(*in, std::min(std::max(threads, 1), kMaxThreads), project_ray);
+  });
+}
+
+// See match_points.h: pixels [count, 2] moved to where descriptors agree most.
+AQ_EXPORT int aq_search_descriptors(const SearchDescriptors* in, int threads) {
+  return guarded([&] {
+    for_each_match(*in, std::min(std::max(threads, 1), kMaxThreads), search_descriptor);
+  });
 }
 
 // See fuse_depths.h. Returns the number of pixels with a usable measurement.
