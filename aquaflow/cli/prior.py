@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -201,8 +202,18 @@ def train_compact(
     ] = None,
     held_out: Annotated[
         list[Path] | None,
-        typer.Option(help="Folder of others, to give figures for; may be repeated."),
+        typer.Option(help="Finished dive or pictures to give figures for; may be repeated."),
     ] = None,
+    size: Annotated[
+        float, typer.Option(min=1.0, max=4.0, help="Weights, as a multiple of what ships.")
+    ] = 1.0,
+    start: Annotated[
+        Path | None, typer.Option(help="Exported compact prior to start from; else at random.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.0, help="Highest learning rate; 2e-3, from a start 1e-4.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=0, help="Processes that render ahead.")] = 0,
     hours: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after so many; the same command goes on.")
     ] = None,
@@ -210,7 +221,7 @@ def train_compact(
     device: Annotated[str, typer.Option(help="cpu | cuda")] = "cpu",
     as_json: Json = False,
 ) -> None:
-    """Train the compact prior on generated pictures, from scratch; resumes from --out.
+    """Train the compact prior on generated pictures and finished dives; resumes from --out.
 
     30 pairs a second on one core; set MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ to
     2000000000, or the pages of every step are given back and asked for again.
@@ -218,18 +229,26 @@ def train_compact(
     import torch
 
     from aquaflow.lab.training.compact import CompactSettings
-    from aquaflow.lab.training.compact_run import PRIOR, CompactRun
+    from aquaflow.lab.training.compact_run import PRIOR, RATE, RATE_FROM_START, CompactRun
     from aquaflow.lab.training.compact_run import train_compact as run_training
 
     torch.set_num_threads(usable_threads(threads))
     settings = CompactSettings(batch=batch, scenes=scenes, first_scenes=min(160, scenes))
+    if rate is None:
+        rate = RATE if start is None else RATE_FROM_START
+    if start is not None:  # what it knows needs neither calm water nor the rate of random weights
+        settings = replace(settings, calm_steps=0)
     run = CompactRun(
+        rate=rate,
         seed=seed,
         steps=steps,
         settings=settings,
         pictures=tuple(pictures or ()),
         maps=tuple(maps or ()),
         held_out=tuple(held_out or ()),
+        size=size,
+        start=start,
+        workers=workers,
     )
     with progress_bars(as_json) as advance:
         card = run_training(run, out, advance, device, hours)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +15,8 @@ import torch
 
 from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.lab.networks.compact.export import export
-from aquaflow.lab.networks.compact.network import CompactPrior
-from aquaflow.lab.training.compact import CompactSettings, CompactTask
+from aquaflow.lab.networks.compact.network import CompactPrior, NetworkSize
+from aquaflow.lab.training.compact import CompactSettings, CompactTask, multiplies_bfloat16
 from aquaflow.lab.training.compact_range import (
     calibration_figures,
     normalised_errors,
@@ -25,7 +28,18 @@ from aquaflow.lab.training.compact_recall import (
     onnx_encoder,
     tracked_recall,
 )
-from aquaflow.lab.training.held_out import RANGE_SET, SETS, held_out_pairs, turned_pictures
+from aquaflow.lab.training.compact_start import started
+from aquaflow.lab.training.held_out import (
+    RANGE_SET,
+    REAL,
+    SETS,
+    check_held_out,
+    held_out_pairs,
+    is_dive,
+    mapped_pairs,
+    name_of,
+    turned_pictures,
+)
 from aquaflow.lab.training.held_out import SEED as HELD_OUT_SEED
 from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water
 from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
@@ -42,7 +56,7 @@ from aquaflow.lab.training.trainer import (
     has_ended,
     train,
 )
-from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, write_card
+from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card
 from aquaflow.prior.runtime import INT8_ENCODER
 
 POOL, PRIOR = "pool", "prior"
@@ -51,6 +65,11 @@ REGULAR_SHARE = 0.2
 """Of the pool's scenes: tiles and nets."""
 VALIDATE_EVERY = 1000
 """Steps: a validation takes as long as 60 of them."""
+ROWS = 12
+"""Validations of a run that is too short for as many at VALIDATE_EVERY."""
+RATE, RATE_FROM_START = 2e-3, 1e-4
+"""Highest learning rate from random weights, and from weights that know already: at 5e-4 these lost
+a third of their matches in 84 steps (notes/2026-11-priors.md#student)."""
 CALIBRATION_SEED = 2000
 """Of the water over the pictures that 8-bit ranges are taken from."""
 CALIBRATION_SHARDS = 2
@@ -66,7 +85,7 @@ class CompactRun:
     hold: float = 0.7
     """Share of the steps at the highest rate; the rest anneals, on larger windows and with maps."""
     warm_up: int = 100
-    rate: float = 2e-3
+    rate: float = RATE
     lowest_rate: float = 2e-5
     settings: CompactSettings = field(default_factory=CompactSettings)
     looks: WindowVariation = field(default_factory=WindowVariation)
@@ -79,7 +98,14 @@ class CompactRun:
     """Dive folders whose maps give pairs too, once the rate falls: up to there a run is the same
     with and without them, and a map may be made by the weights of that time."""
     held_out: tuple[Path, ...] = ()
-    """Folders of others, for figures of turned real pictures."""
+    """Folders of others: of finished dives, for figures of pairs of their maps at every validation,
+    or of pictures, for figures of these turned once the training is over."""
+    size: float = 1.0
+    """Weights of the network, as a multiple of those that ship."""
+    start: Path | None = None
+    """Exported prior that the weights are taken from; None: they are random."""
+    workers: int = 0
+    """Processes that render scenes ahead; none changes what is learnt."""
 
     @property
     def schedule(self) -> Schedule:
@@ -101,11 +127,13 @@ def train_compact(
 
     Raises:
         InputError: ``out`` holds the checkpoint of another network, there is no such device, a
-            folder of pictures holds none, or a dive no map that can be learnt from.
+            folder of pictures holds none, a dive no map that can be learnt from, or a dive is
+            held out and learned from.
     """
     place = device_called(device)
+    dives = [folder for folder in run.held_out if is_dive(folder)]
+    check_held_out(dives, run.maps)
     torch.manual_seed(run.seed)
-    network = CompactPrior().to(place)
     pool = Pool(out / POOL, run.seed, detail=Detail(regular=REGULAR_SHARE))
     real = RealPictures(run.pictures, pool.width, pool.height) if run.pictures else None
     maps = map_pairs(run, pool, progress) if run.maps else None
@@ -113,7 +141,12 @@ def train_compact(
     for shard in range(first):
         pool.ensure(shard)
         progress("scenes", shard + 1, first)
-    held_out = held_out_pairs(out, SETS["wide"])
+    held_out = {"": held_out_pairs(out, SETS["wide"])}
+    of_dives = {
+        name_of(dive): mapped_pairs(out, dive, pool.width, pool.height, progress) for dive in dives
+    }
+    held_out |= {f"{name}_": pairs for name, pairs in of_dives.items()}
+    network = first_network(run, pool).to(place)
     task = CompactTask(
         network,
         pool,
@@ -125,17 +158,49 @@ def train_compact(
         maps,
         run.schedule.hold,
     )
-    plan = TrainingPlan(run.schedule, validate_every=VALIDATE_EVERY, hours=hours)
-    history = train(task, plan, out, progress)
+    plan = TrainingPlan(
+        run.schedule,
+        validate_every=min(VALIDATE_EVERY, max(run.steps // ROWS, 1)),
+        validate_first=run.start is not None,
+        hours=hours,
+    )
+    with rendering_ahead(pool, -(-run.settings.scenes // SHARD), run.workers):
+        history = train(task, plan, out, progress)
     if not has_ended(history, run.schedule):
         return None
     record = training_record(run, history, hardware_of(device))
     card = export(network.cpu(), out / PRIOR, record, calibration(pool), progress)
     card = with_honest_range(out / PRIOR, card, held_out_pairs(out, RANGE_SET))
     sets = {name: held_out_pairs(out, chosen) for name, chosen in SETS.items()}
-    if run.held_out:
-        sets["real"] = turned_pictures(run.held_out)
+    sets |= of_dives
+    pictures = [folder for folder in run.held_out if folder not in dives]
+    if pictures:
+        sets[REAL] = turned_pictures(pictures)
     return with_figures(out / PRIOR, card, sets)
+
+
+def first_network(run: CompactRun, pool: Pool) -> CompactPrior:
+    """Of the run's size, with the weights that its training starts from.
+
+    Raises:
+        InputError: the prior to start from is none, or larger.
+    """
+    size = NetworkSize().times(run.size)
+    if run.start is None:
+        return CompactPrior(size)
+    return started(run.start, size, through_water(Draw(CALIBRATION_SEED), first_pairs(pool)))
+
+
+@contextmanager
+def rendering_ahead(pool: Pool, shards: int, workers: int) -> Iterator[None]:
+    """Meanwhile other processes render what the pool lacks, in the order of its use."""
+    if workers == 0:
+        yield
+        return
+    ahead = replace(pool)  # without the pairs in memory: every task carries it
+    with get_context("spawn").Pool(workers, torch.set_num_threads, (1,)) as processes:
+        processes.map_async(ahead.ensure, range(shards), chunksize=1)
+        yield
 
 
 def map_pairs(run: CompactRun, pool: Pool, progress: Progress) -> MapPairs:
@@ -175,6 +240,8 @@ def training_record(
         "seed": run.seed,
         "pool_seed": run.seed,
         "held_out_seed": HELD_OUT_SEED,
+        "size": run.size,
+        "start": None if run.start is None else sha256_of(run.start / CARD),
         "steps": run.steps,
         "pairs": run.steps * run.settings.batch,
         "scenes": run.settings.scenes,
@@ -191,17 +258,23 @@ def training_record(
 
 def hardware_of(device: str) -> str:
     """What trains, in words."""
-    if torch.device(device).type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, bfloat16"
+    place = torch.device(device)
+    arithmetic = "bfloat16" if multiplies_bfloat16(place) else "32 bits"
+    if place.type == "cuda":
+        return f"{torch.cuda.get_device_name(place)}, {arithmetic}"
     cores, threads = os.cpu_count(), torch.get_num_threads()
-    return f"{platform.machine()} CPU, {threads} of {cores} cores, bfloat16"
+    return f"{platform.machine()} CPU, {threads} of {cores} cores, {arithmetic}"
 
 
 def calibration(pool: Pool) -> list[Any]:
     """[1, 3, H, W] pictures of the pool, through water, for the 8-bit encoder."""
-    pairs = pool.pairs(torch.arange(CALIBRATION_SHARDS * SHARD))
-    seen = through_water(Draw(CALIBRATION_SEED), pairs)
+    seen = through_water(Draw(CALIBRATION_SEED), first_pairs(pool))
     return [image[None].numpy() for image in seen.a.image]
+
+
+def first_pairs(pool: Pool) -> Pair:
+    """Those that statistics are taken from."""
+    return pool.pairs(torch.arange(CALIBRATION_SHARDS * SHARD))
 
 
 # --------------------------------------------------------------------------------------------------

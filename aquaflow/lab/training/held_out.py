@@ -1,4 +1,4 @@
-"""Pairs that the compact prior is never trained on: generated ones, and turned real pictures."""
+"""Pairs that the compact prior is never trained on: generated, of dives, and turned pictures."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from pathlib import Path
 
 import torch
 
+from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import MAP
 from aquaflow.lab.training.pair_generator.cameras import TRAINING, WIDE, WIDER, PairMotion
 from aquaflow.lab.training.pair_generator.conditions import CALM, Conditions
 from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water, windows
+from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
 from aquaflow.lab.training.pair_generator.noise import Draw
 from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.sensor import take_picture
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, Pool
 from aquaflow.lab.training.pairs import Pair, overlap
+from aquaflow.lab.training.trainer import Progress
+from aquaflow.prior.folder import sha256_of
 
 SEED = 1000
 """Of the scenes that are never trained on, and of their water."""
@@ -24,6 +29,12 @@ LEAST_OVERLAP = 0.3
 """As in the paper's pair mining."""
 COUNT = 64
 """Pairs of a set."""
+MAPPED = 32
+"""Pairs of a held-out dive."""
+HELD_OUT_MAPS = "held_out_maps"
+"""Folder of a run that keeps them."""
+REAL = "real"
+"""Name of the figures of real pictures."""
 TOGETHER = 8
 """Pairs of a batch."""
 REAL_SIZE = (480, 360)
@@ -70,6 +81,54 @@ def held_out_pairs(run: Path, chosen: HeldOutSet, count: int = COUNT) -> list[Pa
     return [
         through_water(draw, pool.pairs(torch.tensor(part)), chosen.conditions) for part in parts
     ]
+
+
+def is_dive(folder: Path) -> bool:
+    """True for a finished dive, false for what is meant as a folder of pictures."""
+    return (folder / MAP).is_file()
+
+
+def check_held_out(dives: Sequence[Path], learned: Sequence[Path]) -> None:
+    """Check that no held-out dive is learned from, by another path or as a copy either, and that
+    figures of each have a name of their own.
+
+    Raises:
+        InputError: one is, or two sets of pairs are called the same.
+    """
+    hashes = {sha256_of(dive / MAP): dive for dive in learned if is_dive(dive)}
+    names = {*SETS, REAL}
+    for dive in dives:
+        if (same := hashes.get(sha256_of(dive / MAP))) is not None:
+            raise InputError(
+                f"{dive} is held out and {same}, to be learned from, has the same map; "
+                "leave one of them out"
+            )
+        if name_of(dive) in names:
+            raise InputError(
+                f"figures of {dive} would be called '{name_of(dive)}' like others; "
+                "give a copy or link of another name"
+            )
+        names.add(name_of(dive))
+
+
+def name_of(dive: Path) -> str:
+    """What the figures of a held-out dive are called."""
+    return dive.resolve().name
+
+
+def mapped_pairs(
+    run: Path, dive: Path, width: int, height: int, progress: Progress, count: int = MAPPED
+) -> list[Pair]:
+    """Batches of pairs of a dive's map, rendered where the folder of ``run`` lacks them.
+
+    Raises:
+        InputError: the map is damaged, or shows too little.
+    """
+    maps = MapPairs([dive], run / HELD_OUT_MAPS, SEED, width, height, count)
+    maps.render(progress)
+    draw = Draw(SEED)
+    parts = torch.split(torch.arange(count), TOGETHER)
+    return [through_water(draw, maps.maps[0].pairs(part)) for part in parts]
 
 
 def turned_pictures(folders: Sequence[Path], count: int = COUNT) -> list[Pair]:

@@ -62,6 +62,8 @@ class TrainingPlan:
     """Norm to which gradients are cut."""
     validate_every: int = 500
     """Steps."""
+    validate_first: bool = False
+    """Figures of the weights that a run starts from too, at step 0."""
     save_every: int = 250
     """Steps; a checkpoint holds all that is needed to go on."""
     hours: float | None = None
@@ -103,6 +105,8 @@ def train(
     began, steps = time.process_time() - run.cpu_s, plan.schedule.steps
     sums: dict[str, list[float]] = {}
     until = math.inf if plan.hours is None else time.monotonic() + 3600.0 * plan.hours
+    if process.leads and plan.validate_first and run.step == 0:
+        _validate(task, plan, run, sums, out)
     while run.step < steps:
         for name, value in _step(task, optimiser, plan, run.step, process).items():
             sums.setdefault(name, []).append(value)
@@ -110,12 +114,8 @@ def train(
         last, over = run.step == steps, time.monotonic() >= until
         if process.leads and (last or run.step % plan.validate_every == 0):
             run.cpu_s = time.process_time() - began
-            run.history.append(_row(task, plan, run, sums))
+            _validate(task, plan, run, sums, out)
             sums = {}
-            with atomic_write(out / HISTORY) as stream:
-                stream.write(json.dumps(run.history, indent=1).encode() + b"\n")
-            draw_curve(run.history, out / CURVE)
-            log.info("%s", json.dumps(run.history[-1]))
         if process.leads and (last or over or run.step % plan.save_every == 0):
             run.cpu_s = time.process_time() - began
             _save(task.network, optimiser, run, out / CHECKPOINT)
@@ -158,13 +158,18 @@ def _step(
     return means
 
 
-def _row(
-    task: Task, plan: TrainingPlan, run: _Run, sums: dict[str, list[float]]
-) -> dict[str, float]:
+def _validate(
+    task: Task, plan: TrainingPlan, run: _Run, sums: dict[str, list[float]], out: Path
+) -> None:
+    """A row more for the history and its picture."""
     row = {"step": float(run.step), "cpu_s": round(run.cpu_s, 1)}
     row["rate"] = plan.schedule.rate(run.step - 1)
     row |= {f"loss_{name}": sum(values) / len(values) for name, values in sums.items()}
-    return row | task.validate()
+    run.history.append(row | task.validate())
+    with atomic_write(out / HISTORY) as stream:
+        stream.write(json.dumps(run.history, indent=1).encode() + b"\n")
+    draw_curve(run.history, out / CURVE)
+    log.info("%s", json.dumps(run.history[-1]))
 
 
 def _save(network: nn.Module, optimiser: torch.optim.Optimizer, run: _Run, path: Path) -> None:

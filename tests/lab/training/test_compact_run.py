@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from aquaflow import cli
-from aquaflow.lab.networks.compact.network import CompactPrior, Encoded, NetworkSize
+from aquaflow.base.errors import InputError
+from aquaflow.lab.networks.compact.export import load_checkpoint
+from aquaflow.lab.networks.compact.network import Encoded, NetworkSize
 from aquaflow.lab.training import compact, compact_run, held_out
 from aquaflow.lab.training import compact_run as compact_figures
 from aquaflow.lab.training.compact import CompactSettings
@@ -25,10 +28,17 @@ from aquaflow.lab.training.compact_run import (
     CompactRun,
     calibration,
     hardware_of,
+    rendering_ahead,
     training_record,
     with_honest_range,
 )
-from aquaflow.lab.training.held_out import SETS, held_out_pairs, turned_pictures
+from aquaflow.lab.training.held_out import (
+    SETS,
+    check_held_out,
+    held_out_pairs,
+    mapped_pairs,
+    turned_pictures,
+)
 from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.stored_pairs import Pool
@@ -57,7 +67,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes, network and held-out set of a size that takes seconds."""
     monkeypatch.setattr(held_out, "Pool", small_pool)
     monkeypatch.setattr(compact_run, "Pool", small_pool)
-    monkeypatch.setattr(compact_run, "CompactPrior", partial(CompactPrior, SMALL))
+    monkeypatch.setattr(compact_run, "NetworkSize", lambda: SMALL)
     monkeypatch.setattr(compact_run, "held_out_pairs", partial(held_out_pairs, count=4))
 
 
@@ -162,6 +172,83 @@ def test_the_command_takes_maps_of_dives(tmp_path: Path, monkeypatch: pytest.Mon
     assert "finished dive" in str(missing.exception or missing.output)
 
 
+@pytest.mark.usefixtures("small")
+def test_a_held_out_dive_has_figures_and_is_never_learned_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dive, other = small_dive(tmp_path / "reef"), small_dive(tmp_path / "bay", seed=1)
+    monkeypatch.setattr(compact_run, "mapped_pairs", partial(mapped_pairs, count=8))
+    monkeypatch.setattr(compact, "CompactSettings", partial(CompactSettings, map_pairs=8))
+    out = tmp_path / "out"
+    options = ["--scenes", "8", "--batch", "2", "--steps", "2", "--out", str(out)]
+    command = ["lab", "prior", "train", "compact", *options, "--held-out", str(dive)]
+    monkeypatch.setattr(compact_run, "has_ended", lambda history, schedule: False)
+    result = CliRunner().invoke(cli.app, [*command, "--maps", str(other)])
+    assert result.exit_code == 0, result.output
+    row = json.loads((out / "history.json").read_text())[-1]
+    assert {"fine_2px", "reef_fine_2px", "reef_log_range"} <= set(row)
+    learned = {path.name[:16] for path in (out / compact_run.POOL).glob("map_*.pt")}
+    held = {path.name[:16] for path in (out / held_out.HELD_OUT_MAPS).glob("map_*.pt")}
+    assert len(learned) == len(held) == 1
+    assert learned.isdisjoint(held)
+
+    copy = shutil.copytree(dive, tmp_path / "copy")
+    refused = CliRunner().invoke(cli.app, [*command, "--maps", str(copy)])
+    assert refused.exit_code != 0
+    assert "has the same map" in str(refused.exception or refused.output)
+
+
+def test_held_out_dives_have_names_of_their_own(tmp_path: Path) -> None:
+    one, other, wide = tmp_path / "a" / "reef", tmp_path / "b" / "reef", tmp_path / "wide"
+    for seed, dive in enumerate((one, other, wide)):
+        dive.parent.mkdir(exist_ok=True)
+        small_dive(dive, seed)
+    check_held_out([one], [other])
+    with pytest.raises(InputError, match="'reef' like others"):
+        check_held_out([one, other], [])
+    with pytest.raises(InputError, match="'wide' like others"):
+        check_held_out([wide], [])
+
+
+@pytest.mark.usefixtures("small")
+def test_a_run_from_weights_begins_with_their_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx", reason="pip install 'aquaflow[export]'")
+    monkeypatch.setattr(compact_run, "NetworkSize", NetworkSize)
+    options = ["--scenes", "16", "--batch", "2", "--steps", "3", "--out", str(tmp_path)]
+    command = ["lab", "prior", "train", "compact", *options, "--hours", "0"]
+    result = CliRunner().invoke(cli.app, [*command, "--start", str(SHIPPED)])
+    assert result.exit_code == 0, result.output
+    rows = json.loads((tmp_path / "history.json").read_text())
+    assert [row["step"] for row in rows] == [0.0, 1.0]
+    assert rows[0]["coarse_8px"] > 0.3
+
+
+@pytest.mark.usefixtures("small")
+def test_a_run_of_another_size_is_refused_the_checkpoint(tmp_path: Path) -> None:
+    options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(tmp_path)]
+    command = ["lab", "prior", "train", "compact", *options, "--hours", "0"]
+    assert CliRunner().invoke(cli.app, [*command, "--size", "4"]).exit_code == 0
+    kept = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert kept.size == SMALL.times(4.0)
+    assert CliRunner().invoke(cli.app, [*command, "--size", "4"]).exit_code == 0
+    other = CliRunner().invoke(cli.app, command)
+    assert "another network" in str(other.exception or other.output)
+
+
+def test_processes_that_render_ahead_make_the_same_scenes(tmp_path: Path) -> None:
+    one, other = (small_pool(tmp_path / name, 1) for name in ("one", "other"))
+    with rendering_ahead(one, 2, 2):
+        paths = [tmp_path / "one" / f"{one.name}_{shard:05d}.pt" for shard in range(2)]
+        until = time.monotonic() + 120.0
+        while not all(path.is_file() for path in paths) and time.monotonic() < until:
+            time.sleep(0.1)
+    for shard, path in enumerate(paths):
+        other.ensure(shard)
+        assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_the_command_trains_exports_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
@@ -181,4 +268,4 @@ def test_the_command_trains_exports_and_goes_on_where_it_stopped(tmp_path: Path)
     assert json.loads(again.stdout)["steps"] == 3
 
     rows = json.loads((tmp_path / "history.json").read_text())
-    assert [row["step"] for row in rows] == [2.0, 3.0]
+    assert [row["step"] for row in rows] == [1.0, 2.0, 3.0]

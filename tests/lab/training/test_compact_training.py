@@ -72,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def task(folder: Path) -> CompactTask:
     pool = Pool(folder, 1, 48, 36, detail=DETAIL)
     looks = replace(LOOKS, width=32, height=32)
-    return CompactTask(network(), pool, [], SETTINGS, lambda step: looks, 1)
+    return CompactTask(network(), pool, {}, SETTINGS, lambda step: looks, 1)
 
 
 class Recorded(CompactTask):
@@ -219,7 +219,7 @@ def with_maps(folder: Path, dive: Path, first_step: int) -> Recorded:
 
 
 def test_a_run_may_be_given_its_maps_when_they_take_part(folder: Path, tmp_path: Path) -> None:
-    dive = small_dive(tmp_path / "dive")
+    dive = small_dive(tmp_path / "dive", kept=4)
     whole = with_maps(folder, dive, 2)
     train(whole, PLAN, tmp_path / "whole", silent)
     for _ in range(2):
@@ -233,6 +233,30 @@ def test_a_run_may_be_given_its_maps_when_they_take_part(folder: Path, tmp_path:
     weights = [list(each.network.state_dict().values()) for each in (whole, resumed, without)]
     assert all(map(torch.equal, weights[0], weights[1]))
     assert not all(map(torch.equal, weights[0], weights[2]))
+
+
+@pytest.mark.parametrize(
+    ("says", "multiplies"),
+    [("flags : avx2 avx512_bf16", True), ("Features : asimd bf16", True), ("flags : avx2", False)],
+)
+def test_bfloat16_is_used_where_the_processor_has_it(
+    says: str, multiplies: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compact, "CPUINFO", tmp_path / "cpuinfo")
+    multiplies_here = compact.multiplies_bfloat16.__wrapped__
+    assert not multiplies_here(torch.device("cpu"))
+    (tmp_path / "cpuinfo").write_text(says)
+    assert multiplies_here(torch.device("cpu")) == multiplies
+
+
+def test_every_held_out_dive_has_figures_of_its_own(folder: Path, pair: Pair) -> None:
+    learner = task(folder)
+    learner.held_out = {"": [pair], "iui3_": [pair.swap()]}
+    figures = learner.validate()
+    names = {name for name in figures if not name.startswith("iui3_")}
+    assert {"fine_2px", "log_range"} <= names
+    assert set(figures) == names | {f"iui3_{name}" for name in names}
+    assert any(figures[name] != figures[f"iui3_{name}"] for name in names)
 
 
 def test_the_smallest_batch_has_a_pair_of_a_map(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,15 @@ from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.lab.networks.compact.network import COARSE, STRIDE, CompactPrior, Compared, Encoded
+from aquaflow.lab.networks.compact.network import (
+    COARSE,
+    STRIDE,
+    CompactPrior,
+    Compared,
+    Encoded,
+    normalised,
+    size_of,
+)
 from aquaflow.lab.networks.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card
 from aquaflow.prior.runtime import INT8_ENCODER, NetworkSession, RuntimeSettings, quantise
@@ -127,14 +134,15 @@ def parity_of(
 
 
 def load_checkpoint(path: Path) -> CompactPrior:
-    """The network of a training's checkpoint.
+    """The network of a training's checkpoint, of whatever size.
 
     Raises:
         InputError: the file is missing or holds no such network.
     """
-    network = CompactPrior()
     try:
-        network.load_state_dict(torch.load(path, weights_only=True, map_location="cpu")["network"])
+        weights = torch.load(path, weights_only=True, map_location="cpu")["network"]
+        network = CompactPrior(size_of(weights))
+        network.load_state_dict(weights)
     except Exception as error:  # the unpickler lets through whatever damaged bytes make it do
         raise InputError(
             f"{path} is no checkpoint of `lab prior train compact` ({reason_of(error)}); "
@@ -147,13 +155,9 @@ def fold(network: CompactPrior) -> CompactPrior:
     """A copy for inference, its normalisations folded into the convolutions before them."""
     network = copy.deepcopy(network).eval()
     network.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    for module in network.modules():
-        if isinstance(module, nn.Sequential):
-            parts = list(module)
-            for index, (conv, norm) in enumerate(pairwise(parts)):
-                if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
-                    module[index] = fuse_conv_bn_eval(conv, norm)
-                    module[index + 1] = nn.Identity()
+    for module, index, conv, norm in normalised(network):
+        module[index] = fuse_conv_bn_eval(conv, norm)
+        module[index + 1] = nn.Identity()
     return network
 
 

@@ -7,7 +7,9 @@ lies: descriptors that know their position learn nothing else
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -20,13 +22,18 @@ FINE, COARSE = 2, 8
 """Pixels between descriptors along a side."""
 SHARPEST = 4.6
 """Largest logarithm of an inverse temperature."""
+GROUP = 8
+"""Channels that processors multiply at once."""
 SMALLEST = 1e-30
 """Sum of exponentials below which a cell is like no other; far above what 32 bits can hold."""
 
 
 @dataclass(frozen=True)
 class NetworkSize:
-    """Channels by level; defaults are those of the weights that ship."""
+    """Channels by level; defaults are those of the weights that ship.
+
+    A checkpoint and an ONNX file hold it as the shapes of their weights (``size_of``).
+    """
 
     levels: tuple[int, int, int, int] = (16, 32, 64, 128)
     """At 1/2, 1/4, 1/8 and 1/16."""
@@ -38,6 +45,38 @@ class NetworkSize:
     """Numbers of a coarse descriptor."""
     head: int = 32
     """Channels of the range head."""
+
+    def times(self, factor: float) -> NetworkSize:
+        """The size of about ``factor`` times as many weights; descriptors stay as long.
+
+        Convolutions are wider, to whole groups of GROUP channels: their weights grow with the
+        square.
+        """
+
+        def widen(channels: int) -> int:
+            return channels if factor == 1.0 else GROUP * round(channels * factor**0.5 / GROUP)
+
+        a, b, c, d = map(widen, self.levels)
+        e, f, g = map(widen, self.merged)
+        return NetworkSize((a, b, c, d), (e, f, g), self.fine, self.coarse, widen(self.head))
+
+
+def size_of(
+    weights: Mapping[str, Tensor],  # [...] each, by their names in CompactPrior
+) -> NetworkSize:
+    """The size that these weights are of.
+
+    Raises:
+        KeyError: they are of another network.
+    """
+
+    def channels(layer: str) -> int:
+        return len(weights[f"{layer}.weight"])
+
+    a, b, c, d = (channels(f"encoder.down_{n}.0.0") for n in (2, 4, 8, 16))
+    e, f, g = (channels(f"encoder.up_{n}.below") for n in (8, 4, 2))
+    fine, coarse = channels("encoder.fine"), channels("encoder.coarse")
+    return NetworkSize((a, b, c, d), (e, f, g), fine, coarse, channels("comparison.range.0.0"))
 
 
 class Encoded(NamedTuple):
@@ -248,6 +287,17 @@ def convolve(channels: int, out: int, size: int, stride: int, dilation: int = 1)
         nn.BatchNorm2d(out),
         nn.ReLU(inplace=True),
     )
+
+
+def normalised(
+    network: nn.Module,
+) -> Iterator[tuple[nn.Sequential, int, nn.Conv2d, nn.BatchNorm2d]]:
+    """Every convolution with the normalisation after it, and where it is."""
+    for module in network.modules():
+        if isinstance(module, nn.Sequential):
+            for index, (conv, norm) in enumerate(pairwise(list(module))):
+                if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                    yield module, index, conv, norm
 
 
 class Residual(nn.Module):

@@ -1,7 +1,8 @@
 """Pairs from the maps of finished dives: what really lies on the floor, at known ranges.
 
 The first view is near a mapped one. The second is near another one, or moved as in generated pairs.
-Both are kept only if the map covers them, so that what is learnt from was seen.
+Both are kept only if the map covers them, so that what is learnt from was seen. Where the dive has
+kept pictures of what it mapped, half of the pairs are two of these, with the ranges of the map.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -41,6 +43,7 @@ from aquaflow.lab.training.pairs import (
 )
 from aquaflow.mapping.scene import show
 from aquaflow.mapping.state import NO_PIXELS
+from aquaflow.recordings.kept_pictures import KeptPictures
 from aquaflow.render import select_renderer
 from aquaflow.render.views import View, in_time
 
@@ -51,6 +54,8 @@ FIELD_OF_VIEW = (0.75, 1.15)
 NEAR_ANOTHER = 0.5
 """Share of the second views that are near a mapped one: far from all, maps of one pass have holes,
 and of what is drawn there only the short baselines would be left."""
+PHOTOGRAPHED = 0.5
+"""Share of the pairs that are two pictures which the dive has kept."""
 LEAST_COVERED = 0.7
 """Of either view's pixels, that the map shows at a range that mapped views saw."""
 LEAST_OVERLAP = 0.3
@@ -108,8 +113,11 @@ class MapPool(StoredPairs):
 
     @cached_property
     def name(self) -> str:
-        content = hashlib.sha256(self.map_file.read_bytes()).hexdigest()
-        return f"map_{content[:12]}_{self.width}x{self.height}_{self.seed}"
+        pictures = [path for _, path in sorted(kept_pictures(self.map_file).items())]
+        content = hashlib.sha256()
+        for path in (self.map_file, *pictures):
+            content.update(path.read_bytes())
+        return f"map_{content.hexdigest()[:12]}_{self.width}x{self.height}_{self.seed}"
 
     @cached_property
     def scene(self) -> MappedScene:
@@ -132,6 +140,8 @@ class MapPool(StoredPairs):
 
 def drawn_pair(draw: Draw, scene: MappedScene, width: int, height: int) -> Pair | None:
     """One pair, or None if the map does not cover what was drawn."""
+    if len(scene.photographed) > 1 and bool(draw.chance(PHOTOGRAPHED)):
+        return photographed_pair(draw, scene, width, height)
     number = draw.whole(1, below=len(scene.T_wc))
     widest = widest_view_deg(scene.camera, width, height)
     fov = (FIELD_OF_VIEW[0] * widest, FIELD_OF_VIEW[1] * widest)
@@ -145,6 +155,16 @@ def drawn_pair(draw: Draw, scene: MappedScene, width: int, height: int) -> Pair 
     if not _is_covered(b) or float(overlap(pair)) < LEAST_OVERLAP:
         return None
     return _expose(pair)
+
+
+def photographed_pair(draw: Draw, scene: MappedScene, width: int, height: int) -> Pair | None:
+    """Two pictures as the camera took them, or None if the map does not cover them."""
+    chosen = torch.randperm(len(scene.photographed), generator=draw.generator)[:2].tolist()
+    a, b = (scene.photograph(scene.photographed[i], width, height) for i in chosen)
+    pair = Pair(a, b)
+    if not (_is_covered(a) and _is_covered(b)) or float(overlap(pair)) < LEAST_OVERLAP:
+        return None
+    return pair
 
 
 def _second_camera(draw: Draw, scene: MappedScene, a: ViewBatch) -> Tensor:
@@ -190,6 +210,11 @@ def _map_file(dive: Path) -> Path:
         ) from error
 
 
+def kept_pictures(map_file: Path) -> dict[int, Path]:
+    """Pictures that the dive of this map has kept, by the frame's index."""
+    return KeptPictures(map_file.parent, math.inf).paths
+
+
 # --------------------------------------------------------------------------------------------------
 # A dive's map as a scene to take pictures of: its Gaussians without water, from any place.
 
@@ -224,6 +249,14 @@ class MappedScene:
         """[V, 4, 4] the mapped views' cameras to world."""
         self.camera: CameraModel = self._mapped[0].camera
         self._seen: dict[int, ViewBatch] = {}
+        kept = kept_pictures(map_file)
+        self._pictures = {
+            number: kept[view.frame_index]
+            for number, view in enumerate(self._mapped)
+            if view.frame_index in kept
+        }
+        self.photographed = list(self._pictures)
+        """Mapped views whose picture the dive has kept."""
 
     def view(
         self,
@@ -240,6 +273,29 @@ class MappedScene:
         repeated = joined_views([drawn] * len(nearest))
         seen = correspondences(Pair(repeated, witnesses)).visible.sum(0) >= WITNESSES
         return ViewBatch(drawn.image, drawn.depth, K, T_wc, drawn.valid & seen[None])
+
+    def photograph(self, number: int, width: int, height: int) -> ViewBatch:
+        """The picture of a photographed view, its middle as large as fits, at the map's ranges;
+        valid as in ``view``.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        picture = cv2.imread(str(self._pictures[number]), cv2.IMREAD_COLOR_RGB)
+        if picture is None:
+            raise InputError(f"cannot read {self._pictures[number]}; delete it")
+        rows, columns = picture.shape[:2]
+        scale = max(width / columns, height / rows)
+        size = (max(round(scale * columns), width), max(round(scale * rows), height))
+        left, top = (size[0] - width) // 2, (size[1] - height) // 2
+        resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        window = resized[top : top + height, left : left + width]
+        K = torch.from_numpy(self._mapped[number].camera.resize(*size).K).float()[None]
+        K[:, 0, 2] -= left
+        K[:, 1, 2] -= top
+        image = torch.from_numpy(np.ascontiguousarray(window.transpose(2, 0, 1)))[None]
+        drawn = self.view(K, self.T_wc[number][None], width, height)
+        return replace(drawn, image=image.float() / 255.0)
 
     def render_mapped(self, number: int) -> ViewBatch:
         """The map as drawn from a mapped view, valid where it is solid."""

@@ -17,6 +17,7 @@ from aquaflow.lab.networks.compact.network import (
     coarse_at,
     fine_around,
     locally_normalised,
+    size_of,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,6 +42,18 @@ def cells(count: int = 1) -> tuple[Tensor, Tensor]:
     Dc = torch.eye(rows * columns).reshape(1, -1, rows, columns).expand(count, -1, -1, -1)
     K = torch.tensor([[[50.0, 0.0, 30.0], [0.0, 55.0, 25.0], [0.0, 0.0, 1.0]]])
     return Dc, cell_rays(K.expand(count, -1, -1), HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 3.0, 4.0])
+def test_a_size_has_so_many_times_the_weights_and_is_read_off_them(factor: float) -> None:
+    shipped, larger = (CompactPrior(NetworkSize().times(f)) for f in (1.0, factor))
+    ratio = sum(p.numel() for p in larger.parameters()) / sum(
+        p.numel() for p in shipped.parameters()
+    )
+    assert ratio == pytest.approx(factor, rel=0.05)
+    assert size_of(larger.state_dict()) == larger.size
+    assert shipped.size == NetworkSize()
+    assert (larger.size.fine, larger.size.coarse) == (shipped.size.fine, shipped.size.coarse)
 
 
 def test_descriptors_have_unit_length_and_confidence_is_a_probability(

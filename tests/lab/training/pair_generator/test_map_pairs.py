@@ -112,6 +112,61 @@ def test_what_too_few_views_saw_is_shown_and_not_learnt_from(tmp_path: Path) -> 
     assert float(known.valid.float().mean()) > 0.9
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dive that has kept some of its pictures."""
+    return small_dive(tmp_path_factory.mktemp("dives") / "kept", kept=4)
+
+
+def test_kept_pictures_stand_where_the_map_says_at_its_ranges(kept: Path) -> None:
+    scene = MappedScene(kept / "map.aqf")
+    assert scene.photographed == [0, 1, 2, 3]
+    taken = [scene.photograph(number, WIDTH, HEIGHT) for number in (0, 3)]
+    for view in taken:
+        drawn = scene.view(view.K, view.T_wc, WIDTH, HEIGHT)
+        assert torch.equal(view.depth, drawn.depth)
+        assert torch.equal(view.valid, drawn.valid)
+        error = (view.image - drawn.image).abs().mean(1)
+        assert float(error[view.valid].median()) < 0.03
+    found = correspondences(Pair(*taken))
+    size = torch.tensor([WIDTH, HEIGHT])
+    there = F.grid_sample(taken[1].image, found.pixels / size * 2 - 1, align_corners=False)
+    error = (there - taken[0].image).abs().mean(1)
+    assert float(error[found.visible].median()) < 0.05
+
+
+def test_the_middle_of_a_kept_picture_is_taken_where_the_shape_differs(kept: Path) -> None:
+    scene = MappedScene(kept / "map.aqf")
+    square = scene.photograph(0, 36, 36)
+    assert square.image.shape == (1, 3, 36, 36)
+    assert square.K[0, :2, 2].tolist() == [18.0, 18.0]
+    whole = scene.photograph(0, WIDTH, HEIGHT)
+    assert torch.equal(square.image, whole.image[..., 6:42])
+
+
+def test_half_of_the_pairs_are_kept_pictures_if_there_are_any(
+    kept: Path, dive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_pairs, "photographed_pair", lambda *given: None)
+    for folder, least, most in ((kept, 0.2, 0.8), (dive, 0.0, 0.0)):
+        scene, draw = MappedScene(folder / "map.aqf"), Draw(1)
+        monkeypatch.setattr(scene, "view", lambda *given: pytest.fail("drawn"))
+        photographed = 0
+        for _ in range(40):
+            try:
+                photographed += drawn_pair(draw, scene, WIDTH, HEIGHT) is None
+            except pytest.fail.Exception:
+                continue
+        assert least <= photographed / 40 <= most
+
+
+def test_a_kept_picture_that_changed_makes_other_pairs(kept: Path, tmp_path: Path) -> None:
+    dive = small_dive(tmp_path / "dive", kept=2)
+    before = pairs_of([dive], tmp_path).maps[0].name
+    next((dive / "pictures").iterdir()).unlink()
+    assert pairs_of([dive], tmp_path).maps[0].name != before
+
+
 def test_files_keep_which_depths_are_not_to_be_learnt(dive: Path, tmp_path: Path) -> None:
     maps = pairs_of([dive], tmp_path)
     rendered = maps.maps[0].render(0)
