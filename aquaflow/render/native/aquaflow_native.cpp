@@ -258,16 +258,14 @@ AQ_EXPORT int aq_check_flow(const float* forward, const float* backward, const f
 
 // See match_points.h: pixels [count, 2] whose rays are nearest to the wanted ones.
 AQ_EXPORT int aq_project_rays(const ProjectRays* in, int threads) {
-  return guarded([&] {
-    for_each_match(*in, std::min(std::max(threads, 1), kMaxThreads), project_ray);
-  });
+  return guarded(
+      [&] { for_each_match(*in, std::min(std::max(threads, 1), kMaxThreads), project_ray); });
 }
 
 // See match_points.h: pixels [count, 2] moved to where descriptors agree most.
 AQ_EXPORT int aq_search_descriptors(const SearchDescriptors* in, int threads) {
-  return guarded([&] {
-    for_each_match(*in, std::min(std::max(threads, 1), kMaxThreads), search_descriptor);
-  });
+  return guarded(
+      [&] { for_each_match(*in, std::min(std::max(threads, 1), kMaxThreads), search_descriptor); });
 }
 
 // See fuse_depths.h. Returns the number of pixels with a usable measurement.

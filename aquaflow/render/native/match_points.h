@@ -23,10 +23,12 @@ struct ProjectRays {
   float* off;     // [count] px between the ray found and the ray wanted
 };
 
-// The bilinear ray at an index in [0, w - 1] x [0, h - 1], less the wanted one, and its derivatives.
+// The bilinear ray at an index in [0, w - 1] x [0, h - 1], less the wanted one, and its
+// derivatives.
 struct RayError {
   RayError(const ProjectRays& in, const float* wanted, float x, float y) {
-    const int left = std::min((int)x, in.size.width - 2), top = std::min((int)y, in.size.height - 2);
+    const int left = std::min((int)x, in.size.width - 2),
+              top = std::min((int)y, in.size.height - 2);
     const float fx = x - (float)left, fy = y - (float)top;
     const float* up = in.rays + 3 * ((size_t)top * in.size.width + left);
     const float* down = up + 3 * (size_t)in.size.width;
