@@ -255,11 +255,12 @@ def position_sigma(
     p_n: Array,  # [3]
 ) -> float | None:
     """m, 1 sigma of a place in the direction that is known least; None where it is not known."""
-    if not (frame.metric and frame.level):
-        return None  # of a frame that is not level, no turn is known
+    if not (frame.georeferenced or (frame.metric and frame.level)):
+        return None  # no turn is known
     return float(np.sqrt(np.linalg.eigvalsh(frame.position_covariance(p_n))[-1]))
 
 
 def heading_sigma_deg(frame: WorldFrame) -> float | None:
-    """1 sigma of the heading of n; None while gravity is unknown."""
-    return float(np.degrees(frame.heading_sigma_rad)) if frame.level else None
+    """1 sigma of the heading of n; None where nothing says which way x points."""
+    known = frame.level or frame.georeferenced
+    return float(np.degrees(frame.heading_sigma_rad)) if known else None

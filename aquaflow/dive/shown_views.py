@@ -5,7 +5,6 @@ Where gravity is unknown, that plane gives the world frame n its vertical, once,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,9 +13,9 @@ import numpy.typing as npt
 
 from aquaflow.geometry.similarity import nearest_rotation
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.optimise.robust import Cauchy, sigma_of
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View
+from aquaflow.telemetry.ground_plane import down_into_ground
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.sightings import AGREEING, SOLID
 
@@ -31,17 +30,6 @@ STRIDE_PX = 8
 REACH = 3.0
 """Times the median range of a view up to which what it shows counts: what is farther is drawn from
 a ninth of the pixels."""
-ROUNDS = 10
-"""Of weighted fits; five or six leave less than 0.1 degrees."""
-KERNEL = Cauchy(2.4)
-"""Of distances from the plane."""
-LARGEST_RELIEF = 0.5
-"""Thickness of what has a plane, over its lesser width, both as standard deviations: judgement.
-The ground of the surveys 1, 3, 6 and 7 has 0.07 to 0.19, an even ball has 1."""
-LARGEST_LOOK_DEG = 30.0
-"""Between the cameras' viewing directions, by their mean cosine, and the normal of what they show,
-up to which that plane is taken for the ground, seen squarely. The mean direction of the surveys 1,
-3, 6 and 7, which look down, has 14, 4, 2 and 10; that of the reef clip, which looks ahead, 61."""
 
 
 @dataclass(frozen=True)
@@ -108,36 +96,21 @@ class ShownViews:
         return votes > 0
 
 
-def mean_normal(shown: Sequence[ShownPoints]) -> Array | None:
-    """[3] unit normal of the plane that the points lie about, of either sign; None where they lie
-    about none. Every view has the same weight, however much of it shows the map."""
-    if not shown:
-        return None
-    points = np.concatenate([each.places for each in shown])
-    equal = np.concatenate([np.full(len(each.places), 1.0 / len(each.places)) for each in shown])
-    weights = equal
-    for _ in range(ROUNDS):
-        offset = points - np.average(points, axis=0, weights=weights)
-        spread, axes = np.linalg.eigh((weights[:, None] * offset).T @ offset / weights.sum())
-        across = offset @ axes[:, 0]
-        weights = equal * KERNEL.weight(across / max(sigma_of(across), 1e-12))
-    if spread[0] > LARGEST_RELIEF**2 * spread[1]:
-        return None
-    return np.asarray(axes[:, 0])
-
-
 def on_ground(frame: WorldFrame, mapper: Mapper) -> WorldFrame:
     """The frame of a map with z into the ground and x to the top of the first picture, where
     gravity is unknown and the views look squarely at the mean plane of what they show; else the
-    frame as it is, and so that of an earlier dive."""
-    if frame.level or frame.site or not mapper.views or not len(mapper.gaussians):
+    frame as it is, and so that of an earlier dive. Every view has the same weight, however much of
+    it shows the map."""
+    if frame.has_vertical or frame.site or not mapper.views or not len(mapper.gaussians):
         return frame
-    down = mean_normal(ShownViews(mapper).points())
+    shown = ShownViews(mapper).points()
+    if not shown:
+        return frame
+    places = np.concatenate([each.places for each in shown])
+    weights = np.concatenate([np.full(len(each.places), 1.0 / len(each.places)) for each in shown])
+    looks = np.array([view.T_wc.R[:, 2] for view in mapper.views])
+    down = down_into_ground(places, weights, looks)
     if down is None:
-        return frame
-    look = np.mean([view.T_wc.R[:, 2] for view in mapper.views], axis=0)
-    down = down * np.sign(down @ look)
-    if down @ look < np.cos(np.radians(LARGEST_LOOK_DEG)):
         return frame
     # A survey's lines go there and back, so that only the first picture's top is sure to exist.
     first = min(mapper.views, key=lambda view: view.frame_index)

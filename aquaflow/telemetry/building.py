@@ -28,6 +28,7 @@ from aquaflow.telemetry.factors import (
     TiltFactor,
     VelocityFactor,
 )
+from aquaflow.telemetry.ground_plane import SLOPE_SIGMA, down_into_ground
 from aquaflow.telemetry.solve import ANY_TURN, FIXED, OPEN_M, Carried, TelemetryProblem
 from aquaflow.telemetry.state import (
     CAMERA,
@@ -67,7 +68,7 @@ def problem_of(
     usable = UsableSeries.of(telemetry, path, rejected)
     compasses = [each for each in usable.attitude if (each.source, "heading") not in rejected]
     declination = declination_of(telemetry, config)
-    problem = orient(usable, compasses, path, config, mounting, carried, declination)
+    problem = orient(usable, compasses, path, config, mounting, carried, declination, points)
     extra = [factor for factor in extra if (factor.source, factor.kind) not in rejected]
     problem.reports += usable.left_out
     _scale(problem, usable, path, extra)
@@ -256,6 +257,7 @@ def orient(
     mounting: MountingConfig | None,
     carried: Carried | None,
     declination: float | None,
+    points: Callable[[], Array],
 ) -> TelemetryProblem:
     """The problem with what says how the body and the map are turned; ``compasses`` are the
     attitudes whose heading counts, and ``declination`` what to add to it, rad."""
@@ -271,7 +273,7 @@ def orient(
         problem.prior[HEADING] = carried.heading_sigma
         problem.declination_known |= carried.true_north
     _add_directions(problem, usable, compasses, path)
-    _add_directions_of_fixes(problem, usable, path, config.depth_change_sigma_m)
+    _add_directions_of_fixes(problem, usable, path, config.depth_change_sigma_m, points)
     if not problem.level:
         why = "nothing measures where down is"
         problem.reports += [SourceReport(s.source, "depth", reason=why) for s in usable.depth]
@@ -344,17 +346,30 @@ def _add_directions(
 
 
 def _add_directions_of_fixes(
-    problem: TelemetryProblem, usable: UsableSeries, path: CameraPath, depth_change_sigma_m: float
+    problem: TelemetryProblem,
+    usable: UsableSeries,
+    path: CameraPath,
+    depth_change_sigma_m: float,
+    points: Callable[[], Array],
 ) -> None:
     """Where nothing else does: down from where fixes lie in the map, at their depths or else at a
-    constant one."""
+    constant one, and from the ground that the camera looks squarely at; a line of fixes has no
+    other."""
     if problem.level or not usable.position:
         return
     depth = usable.depth[0] if usable.depth else None
     found = rough.map_from_fixes(usable.position[0], depth, path)
     if found is None:
         return
-    problem.start = replace(problem.start, R_nm=found[0], log_scale=float(np.log(found[1])))
+    R_nm, scale = found
+    ground = points()
+    down = down_into_ground(ground, np.ones(len(ground)), path.R_mc[:, :, 2])
+    if down is not None:
+        R_nm = rough.level_with(down)
+        problem.prior[TURN][:2] = SLOPE_SIGMA
+        problem.on_ground = True
+        problem.reports.append(SourceReport("assumed", "level_ground", used=len(ground)))
+    problem.start = replace(problem.start, R_nm=R_nm, log_scale=float(np.log(scale)))
     problem.level = True
     if depth is None:
         problem.factors.append(ConstantDepthFactor(path, depth_change_sigma_m))

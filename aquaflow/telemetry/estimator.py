@@ -136,7 +136,8 @@ WORTH_NAMING = 5.0
 
 
 def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) -> WorldFrame:
-    """The frame, in metres and level only as far as its covariance allows."""
+    """The frame, in metres and level only as far as its covariance allows: with a vertical also
+    where that is across the ground."""
     state, covariance = solution.state, _left_tangent(solution)
     if any(factor.kind == "depth" for factor in problem.factors):
         covariance[2, 2] += ZERO_DEPTH_SIGMA_M**2
@@ -147,16 +148,18 @@ def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) ->
     T_nm = Sim3(state.R_nm, state.t_n, state.scale)
     if not metric:
         T_nm = Sim3(state.R_nm, np.zeros(3), 1.0)
-    if not level:
+    upright = level or problem.on_ground
+    if not upright:
         T_nm = Sim3(np.eye(3), np.zeros(3), T_nm.scale)
     return WorldFrame(
         T_nm,
         covariance,
         metric=metric,
         level=level,
-        north=_north(problem, kinds) if level else "first keyframe",
+        on_ground=upright and not level,
+        north=_north(problem, kinds) if upright else "first keyframe",
         depth_known=metric and level and "depth" in kinds,
-        origin=problem.origin if metric and level else None,
+        origin=problem.origin if metric and upright else None,
         T_bc=Sim3(state.R_bc, state.c_b) if problem.mounted else None,
         scale_source=_scale_source(problem, solution, path, scale_sigma),
         sources=(*_reports(problem, solution), *problem.reports),

@@ -278,6 +278,8 @@ class TelemetryProblem:
     """True if the compass's north is the true one, but for its error."""
     level: bool = False
     """True if something measures down."""
+    on_ground: bool = False
+    """True if nothing but the ground's mean plane and fixes do."""
     mounted: bool = True
     """False if nothing is known of the camera's mounting."""
     origin: Origin | None = None

@@ -25,6 +25,9 @@ from aquaflow.telemetry.telemetry import Series
 
 Array = npt.NDArray[np.float64]
 
+LEAST_ALIKE = 0.5
+"""Correlation of a path and its fixes in the plane, below which they are of different ways, or the
+one is seen from below."""
 LEAST_TURN = np.radians(3.0)
 """rad; rotations about two axes of at least so much show how the camera is mounted."""
 
@@ -156,15 +159,12 @@ def level_fit(
     p_n: Array,  # [N, 3] level, map units
 ) -> tuple[float, float] | None:
     """Scale and turn about the vertical that take the path to the fixes; None if it cannot be."""
-    ours = np.column_stack([p_n[:, :2], np.zeros(len(p_n))])
-    theirs = np.column_stack([fixes_n, np.zeros(len(p_n))])
-    try:
-        T = align(ours, theirs, with_scale=True).T_target_source
-    except InputError:  # all in one place
+    ours, theirs = (xy - xy.mean() for xy in (p_n[:, :2] @ (1.0, 1.0j), fixes_n @ (1.0, 1.0j)))
+    sizes = float(np.linalg.norm(ours)), float(np.linalg.norm(theirs))
+    common = complex(np.vdot(ours, theirs))
+    if min(sizes) < 1e-9 or abs(common) < LEAST_ALIKE * sizes[0] * sizes[1]:
         return None
-    if T.R[2, 2] < 0.0 or T.scale < 1e-9:
-        return None
-    return T.scale, heading_of(T.R)
+    return abs(common) / sizes[0] ** 2, float(np.angle(common))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -3,7 +3,8 @@
 The world frame n is local north-east-down: x points north (or along the initial heading, where no
 compass is trusted), y to the right of it, z down. Its origin is the body at the dive's first pose,
 at the water surface where depth is measured. Without gravity z points into the ground where the
-cameras look squarely at one; else a map stays as it is, and T_nm is the identity but for the scale.
+cameras look squarely at one, and x north where fixes say so; else a map stays as it is, and T_nm is
+the identity but for the scale.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ class WorldFrame:
     level: bool = False
     """True if z points down."""
     on_ground: bool = False
-    """True if z points into the ground instead, across its mean plane (dive/shown_views.py), and x
-    to the top of the first picture: gravity is unknown."""
+    """True if z points into the ground instead, about across its mean plane, and x to the top of
+    the first picture unless ``north`` is known: gravity is unknown."""
     north: North = "first keyframe"
     depth_known: bool = False
     """True if z = 0 is the water surface."""
@@ -122,7 +123,9 @@ class WorldFrame:
     @property
     def ahead(self) -> str:
         """What x points to, in words; empty where n has no vertical."""
-        return self.north if self.level else PICTURE_TOP if self.on_ground else ""
+        if self.on_ground and self.north == "first keyframe":
+            return PICTURE_TOP
+        return self.north if self.has_vertical else ""
 
     @property
     def axes(self) -> str:
@@ -135,7 +138,7 @@ class WorldFrame:
     @property
     def georeferenced(self) -> bool:
         """True if every point of n has a latitude and a longitude."""
-        known = self.origin is not None and self.metric and self.level
+        known = self.origin is not None and self.metric and self.has_vertical
         return known and self.north == "true north"
 
     def is_marked(self, kind: str) -> bool:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from aquaflow import read_dive
 from aquaflow.config import FusionConfig
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.earth import latitude_longitude, north_east
@@ -128,3 +129,35 @@ def test_noisy_fixes_predict_no_worse_than_a_similarity_to_the_same_fixes(survey
     exact = [survey.predicted(given, 0.0 * noise)[1] for given in halves(survey)]
     limit = np.hypot(1.2 * np.sqrt(np.mean(np.square(exact))), 1.5 * SIGMA_M)
     assert np.median(ours) <= limit
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("number", SURVEYS)
+def test_fixes_alone_place_a_survey_on_the_earth(
+    number: int, aquaflow: Cli, shared_data: Path, tmp_path: Path
+) -> None:
+    """Of a line of stills that look down, nothing but the ground says what is level."""
+    folder = shared_data / f"auv_survey_{number}"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there")
+    rows = list(csv.DictReader((folder / "positions_geotiff.csv").open()))
+    truth = np.array([(float(row["northing_m"]), float(row["easting_m"]), 0.0) for row in rows])
+    latitude, longitude = latitude_longitude(truth - truth[0], ORIGIN)
+    table, dive = tmp_path / "fixes.csv", tmp_path / "dive"
+    places = enumerate(zip(latitude, longitude, strict=True))
+    lines = [f"{i},{a:.9f},{b:.9f},0.05" for i, (a, b) in places]
+    table.write_text("\n".join(["t_s,latitude_deg,longitude_deg,sigma_m", *lines]))
+    ran = aquaflow(
+        "map", folder, "--fps", 1, "--telemetry", table, "--telemetry-offset", 0,
+        "--tracking-only", "--out", dive,
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    frame = read_dive(dive).frame
+    assert frame.georeferenced
+    assert frame.scale_sigma < 0.06
+    assert frame.heading_sigma_rad < np.radians(3.5)
+    found = np.loadtxt(dive / "trajectory.tum")[:, 1:3] @ (1.0, 1.0j)
+    true = truth[:, :2] @ (1.0, 1.0j)
+    found, true = found - found.mean(), true - true.mean()
+    assert np.sqrt(np.mean(np.abs(found - true) ** 2)) < 0.02 * np.abs(np.diff(true)).sum()
+    assert abs(np.degrees(np.angle(np.vdot(found, true)))) < 2.0
