@@ -208,13 +208,15 @@ def _resume(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) ->
 
 NOT_FIGURES = ("step", "cpu_s", "rate")
 """Keys of the history that are not drawn."""
+COLOURS = 10
+"""Of lines in one picture; more are dashed, then dotted."""
 
 
 def draw_curve(history: list[dict[str, float]], path: Path) -> None:
     """Training terms on the left, held-out figures on the right, both over CPU time."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4), layout="constrained")
+    figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, 2)
     minutes = [row["cpu_s"] / 60.0 for row in history]
     for name in history[-1]:
@@ -222,13 +224,15 @@ def draw_curve(history: list[dict[str, float]], path: Path) -> None:
             continue
         values = [row.get(name, float("nan")) for row in history]
         loss = name.startswith("loss_")
-        axes[0 if loss else 1].plot(minutes, values, marker=".", label=name.removeprefix("loss_"))
+        axis = axes[0 if loss else 1]
+        dashes = ("-", "--", ":")[len(axis.lines) // COLOURS % 3]
+        axis.plot(minutes, values, dashes, marker=".", label=name.removeprefix("loss_"))
     for axis, title in zip(axes, ("training loss", "held-out pairs"), strict=True):
         axis.set_title(title)
         axis.set_xlabel("CPU minutes")
         axis.grid(alpha=0.3)
         if axis.lines:
-            axis.legend(fontsize=8)
+            axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(path, dpi=100)
 
 
