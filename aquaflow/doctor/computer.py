@@ -165,6 +165,7 @@ PACKAGES = (
     Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
     Package("pye57", "pye57", "survey", "points of a dive as E57"),
     Package("rasterio", "rasterio", "survey", "orthos and heights as GeoTIFF"),
+    Package("contourpy", "contourpy", "survey", "contours of heights"),
     Package("scikit-image", "skimage", "survey", "the surface of a dive as triangles"),
     Package("xatlas", "xatlas", "survey", "textured meshes: OBJ and GLB"),
     Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),

@@ -80,9 +80,6 @@ class WorldFrame:
     """True if lengths are metres."""
     level: bool = False
     """True if z points down."""
-    on_ground: bool = False
-    """True if z points into the ground instead, about across its mean plane, and x to the top of
-    the first picture unless ``north`` is known: gravity is unknown."""
     north: North = "first keyframe"
     depth_known: bool = False
     """True if z = 0 is the water surface."""
@@ -100,6 +97,9 @@ class WorldFrame:
     pictures: nothing that steers may use the scale."""
     site: str = ""
     """The earlier dive whose frame n is, where this one was recognised in it; empty otherwise."""
+    on_ground: bool = False
+    """True if z points into the ground instead, about across its mean plane, and x to the top of
+    the first picture unless ``north`` is known: gravity is unknown."""
 
     @staticmethod
     def unknown(reason: str = "") -> WorldFrame:

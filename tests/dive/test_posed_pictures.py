@@ -207,5 +207,7 @@ def test_the_command_writes_a_folder_in_the_dive(dive: MappedDive, name: str) ->
     asked = ["export", str(dive.path), "--format", name, "--recording", str(dive.recording)]
     result = CliRunner().invoke(app, [*asked, "--json"])
     assert result.exit_code == 0, result.output
-    assert json.loads(result.output) == {"out": str(dive.path / name), "frames": 3}
+    assert json.loads(result.output) == {
+        "out": str(dive.path / name), "frames": 3, "unit": "m", "axes": "x east, y north, z up",
+    }  # fmt: skip
     assert "3 pictures" in CliRunner().invoke(app, asked).output
