@@ -157,13 +157,24 @@ def checked_crop(crop: str) -> str:
         ValueError: it is neither ``left``, ``right`` nor ``x,y,width,height`` in pixels.
     """
     if crop not in {"left", "right"}:
-        try:
-            x, y, width, height = (int(part) for part in crop.split(","))
-        except ValueError:
-            x = y = width = height = -1
-        if min(x, y) < 0 or min(width, height) < 1:
-            raise ValueError(f"{crop[:80]!r} is neither left, right nor x,y,width,height in pixels")
+        crop_sides(crop)
     return crop
+
+
+def crop_sides(crop: str) -> tuple[int, int, int, int]:
+    """x, y, width and height of a crop that states them, px.
+
+    Raises:
+        ValueError: it does not, or no picture has such a part.
+    """
+    said = f"{crop[:80]!r} is neither left, right nor x,y,width,height in pixels"
+    try:
+        x, y, width, height = (int(part) for part in crop.split(","))
+    except ValueError as error:
+        raise ValueError(said) from error
+    if min(x, y) < 0 or min(width, height) < 1:
+        raise ValueError(said)
+    return x, y, width, height
 
 
 class SourceConfig(StageConfig):

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config import SourceConfig
+from aquaflow.config.cameras import crop_sides
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, CameraModel, guess_camera
 from aquaflow.geometry.rectification import Rectifier
 from aquaflow.types import Frame
@@ -121,7 +122,7 @@ def crop_box(crop: str | None, width: int, height: int) -> Box:
     if crop in {"left", "right"}:
         half = width // 2
         return (0 if crop == "left" else width - half, 0, half, height)
-    x, y, w, h = (int(part) for part in crop.split(","))
+    x, y, w, h = crop_sides(crop)
     if x + w > width or y + h > height:
         raise ConfigError(f"crop '{crop}' reaches outside the {width} x {height} picture")
     return (x, y, w, h)
