@@ -255,12 +255,11 @@ def position_sigma(
     p_n: Array,  # [3]
 ) -> float | None:
     """m, 1 sigma of a place in the direction that is known least; None where it is not known."""
-    if not (frame.georeferenced or (frame.metric and frame.level)):
+    if not (frame.metric and frame.has_heading):
         return None  # no turn is known
     return float(np.sqrt(np.linalg.eigvalsh(frame.position_covariance(p_n))[-1]))
 
 
 def heading_sigma_deg(frame: WorldFrame) -> float | None:
     """1 sigma of the heading of n; None where nothing says which way x points."""
-    known = frame.level or frame.georeferenced
-    return float(np.degrees(frame.heading_sigma_rad)) if known else None
+    return float(np.degrees(frame.heading_sigma_rad)) if frame.has_heading else None

@@ -141,6 +141,11 @@ class WorldFrame:
         known = self.origin is not None and self.metric and self.has_vertical
         return known and self.north == "true north"
 
+    @property
+    def has_heading(self) -> bool:
+        """True if something says which way x of n points, and so how well that is known."""
+        return self.level or self.georeferenced
+
     def is_marked(self, kind: str) -> bool:
         """True if a person marked the ``kind``: LENGTH or GRAVITY."""
         return any((source.kind, source.reason) == (kind, MARKED) for source in self.sources)

@@ -255,7 +255,7 @@ def _gravity(frame: WorldFrame) -> str:
 
 
 def _north(frame: WorldFrame) -> str:
-    if not (frame.level or frame.georeferenced):
+    if not frame.has_heading:
         return f"to the {frame.ahead or 'right in the first keyframe'}"
     if frame.north in {"true north", "magnetic north"}:
         return f"to {frame.north}, \u00b1 {np.degrees(frame.heading_sigma_rad):.2g} degrees"
