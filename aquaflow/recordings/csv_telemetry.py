@@ -47,6 +47,13 @@ class CsvTelemetry(TelemetryLog):
     def recognises(cls, path: Path) -> bool:
         return super().recognises(path) and _reader_of(path) is not None
 
+    @classmethod
+    def refusal(cls, path: Path) -> str | None:
+        """Why the table at ``path`` cannot be read; None if it can, or is no table."""
+        if not super().recognises(path) or cls.recognises(path):
+            return None
+        return why_no_survey_table(path)
+
     def samples(self) -> Iterator[TelemetrySample]:
         """Samples in the order of the lines; a line that holds no numbers is skipped.
 
@@ -81,8 +88,9 @@ class CsvTelemetry(TelemetryLog):
         source, bad = self.path.stem, 0
         times = list(self._survey_times())
         utc = LoggedUtc(source, iter([time for time in times if time is not None]))
-        with self.path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-            rows = self._as_far_as_it_is_a_table(csv.DictReader(file))
+        self.notes += unused_columns(self.path)
+        with self.path.open(encoding="utf-8-sig", errors="replace") as file:
+            rows = self._as_far_as_it_is_a_table(rows_of(file))
             for row, time in zip(rows, times, strict=False):
                 try:
                     if time is None:
@@ -99,10 +107,10 @@ class CsvTelemetry(TelemetryLog):
         """Of every row: time in the dive and UTC, ns; None where it states none."""
         clock, newest_ns = LogTime(self.starts_s), -(10**18)
         with (
-            self.path.open(newline="", encoding="utf-8-sig", errors="replace") as file,
+            self.path.open(encoding="utf-8-sig", errors="replace") as file,
             contextlib.suppress(csv.Error),
         ):
-            for row in csv.DictReader(file):
+            for row in rows_of(file):
                 try:
                     if UTC in row:
                         wall_ns = utc_ns(row[UTC])
@@ -118,13 +126,16 @@ class CsvTelemetry(TelemetryLog):
         if lines:
             self.notes.append(f"{lines} lines of {self.path.name} were left out")
 
-    def _as_far_as_it_is_a_table(self, reader: csv.DictReader[str]) -> Iterator[Line]:
+    def _as_far_as_it_is_a_table(self, lines: Iterator[Line]) -> Iterator[Line]:
         """Lines before the first of more than 131,072 characters in a field, csv's limit."""
+        number = 1
         try:
-            yield from reader
+            for line in lines:
+                number += 1
+                yield line
         except csv.Error:
             self.notes.append(
-                f"{self.path.name} is damaged after line {reader.line_num}; the rest was left out"
+                f"{self.path.name} is damaged after line {number}; the rest was left out"
             )
 
 
@@ -133,12 +144,8 @@ Reader: TypeAlias = Callable[[CsvTelemetry], Samples]
 
 def _reader_of(path: Path) -> Reader | None:
     """How to read the table, by its header."""
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            header = tuple(file.readline(10_000).strip().split(","))
-    except OSError:
-        return None
-    ros, gopro = header[0] == TIME, header == ("t_s", "c0", "c1", "c2")
+    header = header_of(path)
+    ros, gopro = header[:1] == (TIME,), header == ("t_s", "c0", "c1", "c2")
     stream = path.stem.rpartition("_")[2]
     known: list[tuple[bool, Reader]] = [
         (header == HEADER, _synthetic),
@@ -219,7 +226,7 @@ def _gopro_force(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[Te
 #
 # A row has a time, ``t_s`` (seconds after the recording's first picture) or ``utc`` (ISO 8601,
 # UTC where it states no offset), and any of the columns of ``QUANTITIES``. Empty cells say
-# nothing.
+# nothing. A spreadsheet of a country with decimal commas separates by semicolons.
 
 SECONDS, UTC = "t_s", "utc"
 """Columns with a row's time; a table has one of them."""
@@ -227,15 +234,94 @@ PLACE = ("latitude_deg", "longitude_deg")
 ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 QUANTITIES = (*PLACE, "sigma_m", "depth_m", *ANGLES, "altitude_m")
 """Columns with what was measured, in any order."""
+SEPARATORS = ",;\t"
+LONGEST_HEADER = 10_000
+"""Characters of a header that are read: what is longer is no table of telemetry."""
 
 Row: TypeAlias = dict[str, str]
 
 
+def header_of(path: Path) -> tuple[str, ...]:
+    """Names of the table's columns; none if the file cannot be read."""
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            return tuple(_names(file.readline(LONGEST_HEADER))[0])
+    except OSError:
+        return ()
+
+
+def _names(line: str) -> tuple[list[str], str]:
+    """Names of the columns in a header, and what separates them."""
+    separator = max(SEPARATORS, key=line.count)
+    try:
+        names = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:
+        names = []
+    return [name.strip() for name in names], separator
+
+
+def rows_of(file: Iterator[str]) -> Iterator[Row]:
+    """Rows below the header, numbers with a decimal point.
+
+    Raises:
+        csv.Error: from the row on at which the file is no table.
+    """
+    names, separator = _names(next(file, "")[:LONGEST_HEADER])
+    rows = csv.DictReader(file, names, restkey=BEYOND, delimiter=separator, skipinitialspace=True)
+    if separator == ",":
+        return iter(rows)
+    return ({name: _with_point(cell) for name, cell in row.items()} for row in rows)
+
+
+BEYOND = "beyond the header"
+"""The name of cells that no column has."""
+
+
+def _with_point(cell: str | None) -> str:
+    return cell.replace(",", ".") if isinstance(cell, str) else ""
+
+
 def is_survey_table(header: tuple[str, ...]) -> bool:
-    """True if every column is known, one is a time, and something was measured."""
+    """True if one column is a time, and another something that was measured."""
     columns = set(header)
     times, measured = columns & {SECONDS, UTC}, columns & set(QUANTITIES) - {"sigma_m"}
-    return len(times) == 1 and bool(measured) and columns == times | (columns & set(QUANTITIES))
+    return len(times) == 1 and bool(measured)
+
+
+def unused_columns(path: Path) -> list[str]:
+    """Sentences about columns of a survey's table that say nothing, each with the reason."""
+    columns = header_of(path)
+    unknown = [name for name in columns if name not in (SECONDS, UTC, *QUANTITIES)]
+    notes = []
+    if unknown:
+        notes.append(
+            f"{path.name} has columns that AquaFlow does not know and did not use: "
+            f"{', '.join(unknown)}; those it knows are {', '.join(QUANTITIES)}"
+        )
+    for together in (PLACE, ANGLES):
+        there = [name for name in together if name in columns]
+        if there and len(there) < len(together):
+            missing = [name for name in together if name not in columns]
+            notes.append(
+                f"{', '.join(there)} of {path.name} could not be used without {', '.join(missing)}"
+            )
+    return notes
+
+
+def why_no_survey_table(path: Path) -> str:
+    """One sentence on what the table at ``path`` lacks."""
+    columns = set(header_of(path))
+    known = f"{SECONDS} (seconds after the first picture) or {UTC} (ISO 8601)"
+    if not columns & set(QUANTITIES):
+        return (
+            f"{path} has none of the columns of a table of telemetry; name its columns "
+            f"{known}, and any of {', '.join(QUANTITIES)}"
+        )
+    if columns >= {SECONDS, UTC}:
+        return f"{path} has two columns of time, {SECONDS} and {UTC}; leave the right one"
+    if not columns & {SECONDS, UTC}:
+        return f"{path} has no column of time; name it {known}"
+    return f"{path} has nothing that was measured; add any of {', '.join(QUANTITIES)}"
 
 
 def utc_ns(text: str) -> int:

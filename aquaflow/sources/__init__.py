@@ -172,6 +172,16 @@ class RecordedTelemetry(TelemetrySource, Protocol):
 
 
 @runtime_checkable
+class RefusesFiles(Protocol):
+    """A reader of telemetry that knows why it cannot read a file of its kind."""
+
+    @classmethod
+    def refusal(cls, path: Path) -> str | None:
+        """One sentence with the cause and what to do; None for a file of another kind."""
+        ...
+
+
+@runtime_checkable
 class StatesSources(Protocol):
     """A recorded camera that says where what it reads comes from, and what it assumes."""
 
@@ -278,7 +288,11 @@ def open_recorded_telemetry(path: Path, starts_s: float = 0.0) -> RecordedTeleme
     """
     found = telemetry_reader(path)
     if found is None:
-        raise InputError(f"no installed source finds telemetry in {path}")
+        reasons = [
+            cls.refusal(path) for cls in _readers(TELEMETRY) if issubclass(cls, RefusesFiles)
+        ]
+        why = next((reason for reason in reasons if reason is not None), None)
+        raise InputError(why or f"no installed source finds telemetry in {path}")
     return found.open(path, starts_s)
 
 
@@ -292,7 +306,11 @@ def telemetry_reader(path: Path) -> type[RecordedTelemetry] | None:
 
 def _best_reader(group: str, path: Path) -> Any:
     """Of the entry points of ``group``, the class of highest specificity that recognises it."""
-    entries = sorted(entry_points(group=group), key=lambda entry: entry.name)
-    readers = [entry.load() for entry in entries]
-    fitting = [cls for cls in readers if hasattr(cls, "recognises") and cls.recognises(path)]
+    readers = [cls for cls in _readers(group) if hasattr(cls, "recognises")]
+    fitting = [cls for cls in readers if cls.recognises(path)]
     return max(fitting, key=lambda cls: cls.specificity) if fitting else None
+
+
+def _readers(group: str) -> list[Any]:
+    entries = sorted(entry_points(group=group), key=lambda entry: entry.name)
+    return [entry.load() for entry in entries]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.recordings.csv_telemetry import CsvTelemetry
 from aquaflow.sources import open_recorded_telemetry
 from aquaflow.types import Altitude, Attitude, Depth, Position, UtcTime
@@ -101,9 +103,70 @@ def test_a_row_without_a_time_costs_itself(tmp_path: Path, utc: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "header", ["t_s", "t_s,sigma_m", "depth_m,altitude_m", "t_s,utc,depth_m", "t_s,depth_m,speed"]
+    ("header", "why"),
+    [
+        ("t_s", "has none of the columns of a table of telemetry"),
+        ("t_s,sigma_m", "has nothing that was measured"),
+        ("depth_m,altitude_m", "has no column of time; name it t_s"),
+        ("t_s,utc,depth_m", "has two columns of time"),
+        ("Time,Depth (m)", "has none of the columns"),
+    ],
 )
-def test_a_table_with_other_columns_is_none_of_these(tmp_path: Path, header: str) -> None:
+def test_a_table_that_cannot_be_read_says_what_it_lacks(
+    tmp_path: Path, header: str, why: str
+) -> None:
     (tmp_path / "a.csv").write_text(f"{header}\n1,2,3\n")
 
     assert not CsvTelemetry.recognises(tmp_path / "a.csv")
+    with pytest.raises(InputError, match=re.escape(why)):
+        open_recorded_telemetry(tmp_path / "a.csv")
+
+
+def test_unknown_columns_are_named_and_cost_nothing_else(tmp_path: Path) -> None:
+    log = table(tmp_path / "a.csv", "t_s,depth_m,water temperature,heading\n2,5,9.5,30\n")
+
+    assert list(log.samples()) == [Depth(2 * SECOND, 2 * SECOND, "a", 5.0)]
+    assert [note.partition(";")[0] for note in log.notes] == [
+        "a.csv has columns that AquaFlow does not know and did not use: water temperature, heading"
+    ]
+
+
+def test_a_column_that_says_nothing_alone_is_named(tmp_path: Path) -> None:
+    log = table(tmp_path / "a.csv", "t_s,heading_deg,depth_m\n2,90,5\n")
+
+    assert [type(s) for s in log.samples()] == [Depth]
+    assert log.notes == ["heading_deg of a.csv could not be used without roll_deg, pitch_deg"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t_s;depth_m;altitude_m\n2,5;5,25;1,5\n",
+        '"t_s";"depth_m";"altitude_m"\r\n"2,5";"5,25";"1,5"\r\n',
+        "t_s\tdepth_m\taltitude_m\n2,5\t5.25\t1,5\n",
+        '"t_s", "depth_m" ,"altitude_m"\n2.5, 5.25,"1.5"\n',
+        "t_s,depth_m,altitude_m\r2.5,5.25,1.5\r",
+    ],
+    ids=["semicolons", "quoted", "tabs", "spaces", "old Mac"],
+)
+def test_tables_are_read_as_spreadsheets_write_them(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_bytes(text.encode())
+    stamp = (2_500_000_000, 2_500_000_000, "a")
+
+    log = open_recorded_telemetry(tmp_path / "a.csv")
+
+    assert list(log.samples()) == [Depth(*stamp, 5.25), Altitude(*stamp, 1.5)]
+    assert log.notes == []
+
+
+def test_a_thousands_comma_is_no_decimal_comma(tmp_path: Path) -> None:
+    log = table(tmp_path / "a.csv", 't_s,depth_m\n2,"1,234"\n')
+
+    assert list(log.samples()) == []
+    assert log.notes == ["1 lines of a.csv were left out"]
+
+
+def test_a_table_in_another_encoding_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes("t_s,depth_m,måling °C\n2,5,ø\n".encode("cp1252"))
+
+    assert [type(s) for s in CsvTelemetry(tmp_path / "a.csv").samples()] == [Depth]
