@@ -225,7 +225,23 @@ def load_camera(path: Path, inside: bool = False) -> CameraModel:
         file = CameraFile.model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{path}: {_what_is_wrong(error)}") from error
-    return file.camera()
+    camera = file.camera()
+    _check_principal_point(path, camera)
+    return camera
+
+
+def _check_principal_point(path: Path, camera: CameraModel) -> None:
+    """A calibration made at one picture size and stated for another is the usual slip.
+
+    Raises:
+        ConfigError: the optical axis does not meet the picture.
+    """
+    if not (0.0 < camera.cx < camera.width and 0.0 < camera.cy < camera.height):
+        raise ConfigError(
+            f"{path}: the principal point ({camera.cx:.0f}, {camera.cy:.0f}) lies outside of the "
+            f"picture of {camera.width} x {camera.height} pixels; give the size of the pictures by "
+            "which the camera was calibrated"
+        )
 
 
 def camera_of_values(values: dict[str, Any]) -> CameraModel:

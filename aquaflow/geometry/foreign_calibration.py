@@ -1,8 +1,9 @@
 """Calibrations as other programs write them, as the values of ``camera.yaml``.
 
-ROS (camera_info_manager), OpenCV's FileStorage, Kalibr's camchain, COLMAP's cameras.txt, Agisoft
-Metashape's XML and OpenDroneMap's cameras.json. Those of ROS, OpenCV and Kalibr count pixel
-centres as integers; COLMAP's, Metashape's and ours put that of the first at 0.5.
+ROS (camera_info_manager), OpenCV's FileStorage, Kalibr's camchain, the settings of ORB-SLAM, VINS
+(camodocal) and OKVIS (SVIn), COLMAP's cameras.txt, Agisoft Metashape's XML and OpenDroneMap's
+cameras.json. COLMAP's, Metashape's and ours put the centre of the first pixel at 0.5; all others
+count pixel centres as integers.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ MODELS: dict[str, Model] = {
     "equidistant": "fisheye", "kannala_brandt": "fisheye", "kannalabrandt4": "fisheye",
     "fisheye": "fisheye", "plumb_bob": "radtan", "rational_polynomial": "radtan",
     "radtan": "radtan", "opencv": "radtan", "brown": "radtan", "radial": "radtan",
-    "none": "none", "": "none",
+    "radialtangential": "radtan", "radialtangential8": "radtan", "pinhole": "radtan",
+    "kannalabrandt8": "fisheye", "rectified": "none", "none": "none", "": "none",
 }  # fmt: skip
 """Names of distortion models in other programs: of Kannala and Brandt (2006), which OpenCV calls
 fisheye, and of OpenCV's usual one."""
@@ -62,19 +64,25 @@ def values_of_file(path: Path) -> Values | None:
 
 
 def values_of_yaml(path: Path, data: Values) -> Values | None:
-    """The values of a mapping that ROS, OpenCV or Kalibr wrote; None if it is none of these.
+    """The values of a mapping that ROS, OpenCV, Kalibr or a SLAM system's user wrote; None if it is
+    none of these.
 
     Raises:
         ConfigError: it is one and holds no camera that we know.
     """
-    cameras = [each for name, each in data.items() if re.fullmatch(r"cam\d+", name)]
-    if cameras:
-        return _read(path, _kalibr, cameras)
-    if "camera_matrix" in data and "image_width" in data and "distortion_model" in data:
-        return _read(path, _ros, data)
-    if {"camera_matrix", "cameraMatrix", "Camera_Matrix", "K"} & set(data):
-        return _read(path, _opencv, data)
-    return None
+    kalibr = [each for name, each in data.items() if re.fullmatch(r"cam\d+", name)]
+    ros = {"camera_matrix", "image_width", "distortion_model"} <= set(data)
+    opencv = {"camera_matrix", "cameraMatrix", "Camera_Matrix", "K"} & set(data)
+    okvis = data.get("cameras")
+    formats = [
+        (bool(kalibr), _kalibr, kalibr),
+        ("Camera.fx" in data or "Camera1.fx" in data, _orb_slam, data),
+        ("model_type" in data, _vins, data),
+        (isinstance(okvis, list), _okvis, okvis),
+        (ros, _ros, data),
+        (bool(opencv), _opencv, data),
+    ]
+    return next((_read(path, reader, held) for fits, reader, held in formats if fits), None)
 
 
 class _NotUnderstoodError(Exception):
@@ -115,6 +123,13 @@ class _Keys:
             raise _NotUnderstoodError(f"key '{key}' holds {len(flat)} numbers instead of {least}")
         return flat
 
+    def section(self, key: str) -> Mapping[str, Any]:
+        """The keys and values below ``key``; none where it is missing."""
+        found = self._values.get(key, {})
+        if not isinstance(found, Mapping):
+            raise _NotUnderstoodError(f"key '{key}' is {_quote(found)}, which is no list of keys")
+        return found
+
     def model(self, key: str, usual: str | None = None) -> Model:
         """The distortion that the text at ``key`` names."""
         name = self.value(key, usual)
@@ -139,7 +154,7 @@ def _quote(value: Any) -> str:
 def _read(path: Path, reader: Any, content: Any) -> Values:
     name = {
         _xml: "Metashape or OpenCV", _odm: "OpenDroneMap", _colmap: "COLMAP", _kalibr: "Kalibr",
-        _ros: "ROS", _opencv: "OpenCV",
+        _ros: "ROS", _opencv: "OpenCV", _orb_slam: "ORB-SLAM", _vins: "VINS", _okvis: "OKVIS",
     }[reader]  # fmt: skip
     try:
         values: Values = reader(content)
@@ -162,7 +177,12 @@ def _values(
 
 def _lens_of(k: Sequence[float]) -> tuple[float, float, float, float]:
     """Of a 3 x 3 matrix whose pixel centres are integers."""
-    return k[0], k[4], k[2] + 0.5, k[5] + 0.5
+    return _at_half(k[0], k[4], k[2], k[5])
+
+
+def _at_half(fx: float, fy: float, cx: float, cy: float) -> tuple[float, float, float, float]:
+    """A lens whose pixel centres are integers, with that of the first at 0.5."""
+    return fx, fy, cx + 0.5, cy + 0.5
 
 
 def _ros(data: Values) -> Values:
@@ -198,7 +218,46 @@ def _kalibr(cameras: list[Values]) -> Values:
         raise _NotUnderstoodError(f"key 'camera_model' is {_quote(model)}, which is not known")
     fx, fy, cx, cy = keys.numbers("intrinsics", 4)[:4]
     size, d = keys.numbers("resolution", 2), keys.numbers("distortion_coeffs")
-    return _values(size, (fx, fy, cx + 0.5, cy + 0.5), keys.model("distortion_model"), d)
+    return _values(size, _at_half(fx, fy, cx, cy), keys.model("distortion_model"), d)
+
+
+def _orb_slam(data: Values) -> Values:
+    """Settings of ORB-SLAM2 and 3 (its Calibration_Tutorial)."""
+    if "Camera2.fx" in data:
+        raise _NotUnderstoodError("it holds 2 cameras; leave Camera1")
+    lens_prefix = "Camera1." if "Camera1.fx" in data else "Camera."
+    lens = {name.removeprefix(lens_prefix): value for name, value in data.items()}
+    keys, shared = _Keys(lens), _Keys(data)
+    model = shared.model("Camera.type", "PinHole")
+    size = shared.number("Camera.width"), shared.number("Camera.height")
+    fx, fy, cx, cy = (keys.number(name) for name in ("fx", "fy", "cx", "cy"))
+    return _values(size, _at_half(fx, fy, cx, cy), model, _d_of(keys, model))
+
+
+def _vins(data: Values) -> Values:
+    """A camera file of VINS, which camodocal wrote (EquidistantCamera.cc counts from k2)."""
+    keys = _Keys(data)
+    size = keys.number("image_width"), keys.number("image_height")
+    model = keys.model("model_type")
+    given = {**keys.section("distortion_parameters"), **keys.section("projection_parameters")}
+    inside = _Keys(given)
+    if model == "fisheye":
+        fx, fy, cx, cy = (inside.number(name) for name in ("mu", "mv", "u0", "v0"))
+        d = [inside.number(f"k{n}", 0.0) for n in (2, 3, 4, 5)]
+    else:
+        fx, fy, cx, cy = (inside.number(name) for name in ("fx", "fy", "cx", "cy"))
+        d = _d_of(inside, model)
+    return _values(size, _at_half(fx, fy, cx, cy), model, d)
+
+
+def _okvis(cameras: list[Any]) -> Values:
+    """The cameras of a configuration of OKVIS, OKVIS2 or SVIn."""
+    if len(cameras) != 1:
+        raise _NotUnderstoodError(f"it holds {len(cameras)} cameras; leave one of them")
+    keys = _Keys(cameras[0])
+    size, d = keys.numbers("image_dimension", 2), keys.numbers("distortion_coefficients")
+    (fx, fy), (cx, cy) = keys.numbers("focal_length", 2)[:2], keys.numbers("principal_point", 2)[:2]
+    return _values(size, _at_half(fx, fy, cx, cy), keys.model("distortion_type"), d)
 
 
 def _colmap(text: str) -> Values:

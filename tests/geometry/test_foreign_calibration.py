@@ -45,6 +45,73 @@ ODM = {
         "p2": -0.002, "k3": 0.02,
     }
 }  # fmt: skip
+ORB_SLAM = """%YAML:1.0
+---
+File.version: "1.0"
+Camera.type: "PinHole"
+Camera1.fx: 500.0
+Camera1.fy: 510.0
+Camera1.cx: 319.5
+Camera1.cy: 239.5
+Camera1.k1: -0.3
+Camera1.k2: 0.1
+Camera1.p1: 0.001
+Camera1.p2: -0.002
+Camera1.k3: 0.02
+Camera.width: 640
+Camera.height: 480
+ORBextractor.nFeatures: 1000
+Tbc: !!opencv-matrix
+   rows: 1
+   cols: 1
+   dt: f
+   data: [1.0]
+"""
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: camera
+image_width: 640
+image_height: 480
+distortion_parameters:
+   k1: -0.3
+   k2: 0.1
+   p1: 0.001
+   p2: -0.002
+projection_parameters:
+   fx: 500
+   fy: 510
+   cx: 319.5
+   cy: 239.5
+"""
+VINS_FISHEYE = """%YAML:1.0
+---
+model_type: KANNALA_BRANDT
+camera_name: camera
+image_width: 640
+image_height: 480
+projection_parameters:
+   k2: -0.06
+   k3: -0.004
+   k4: 0.03
+   k5: -0.03
+   mu: 500
+   mv: 510
+   u0: 319.5
+   v0: 239.5
+"""
+OKVIS = """%YAML:1.0
+cameras:
+     - {T_SC:
+        [ 0, 0, 1, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 1],
+        image_dimension: [640, 480],
+        distortion_coefficients: [-0.3, 0.1, 0.001, -0.002],
+        distortion_type: radialtangential,
+        focal_length: [500, 510],
+        principal_point: [319.5, 239.5]}
+camera_params:
+     camera_rate: 20
+"""
 FULL = "1 FULL_OPENCV 640 480 500 510 320 240 -0.3 0.1 0.001 -0.002 0.02 0 0 0"
 
 FILES = {
@@ -53,7 +120,13 @@ FILES = {
     "metashape.xml": METASHAPE,
     "cameras.json": json.dumps(ODM),
     "cameras.txt": f"# Camera list\n{FULL}\n",
+    "orb_slam.yaml": ORB_SLAM,
+    "orb_slam2.yaml": ORB_SLAM.replace("Camera1.", "Camera.").replace('Camera.type: "PinHole"', ""),
+    "vins.yaml": VINS,
+    "okvis.yaml": OKVIS,
 }
+FOUR_NUMBERS = ("kalibr.yaml", "okvis.yaml")
+"""Files whose distortion has no k3."""
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -62,8 +135,35 @@ def test_the_camera_is_the_one_that_is_meant(tmp_path: Path, name: str) -> None:
     camera = load_camera(tmp_path / name)
     assert (camera.width, camera.height) == (640, 480)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((500, 510, 320, 240))
-    expected = D[:4] if name == "kalibr.yaml" else D
+    expected = {"vins.yaml": (*D[:4], 0.0)}.get(name, D[:4] if name in FOUR_NUMBERS else D)
     assert camera.distortion == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        VINS_FISHEYE,
+        ORB_SLAM.replace("PinHole", "KannalaBrandt8")
+        .replace("k1: -0.3", "k1: -0.06")
+        .replace("k2: 0.1", "k2: -0.004")
+        .replace("p1: 0.001", "k4: -0.03")
+        .replace("k3: 0.02", "k3: 0.03"),
+    ],
+    ids=["VINS", "ORB-SLAM3"],
+)
+def test_fisheye_lenses_of_slam_systems_are_read(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.yaml").write_text(text)
+    camera = load_camera(tmp_path / "c.yaml")
+    assert camera.distortion_model == "fisheye"
+    assert camera.distortion == pytest.approx((-0.06, -0.004, 0.03, -0.03))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((500, 510, 320, 240))
+
+
+@pytest.mark.parametrize("centre", ["662.1, 0, 510, 239.5", "319.5, 0, 510, 482"])
+def test_a_calibration_of_another_picture_size_is_refused(tmp_path: Path, centre: str) -> None:
+    (tmp_path / "c.yaml").write_text(ROS.replace("319.5, 0, 510, 239.5", centre))
+    with pytest.raises(ConfigError, match="lies outside of the picture of 640 x 480 pixels"):
+        load_camera(tmp_path / "c.yaml")
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml"])
@@ -154,6 +254,17 @@ def test_names_of_the_fisheye_model_are_used(tmp_path: Path, name: str) -> None:
         ("cameras.txt", "1 PINHOLE 640 480 5 5 3", "PINHOLE has 3 numbers instead of: fx fy cx cy"),
         ("cameras.txt", "1 PINHOLE 640 x 5 5 3 3", "COLMAP, key 'HEIGHT' is 'x', which is no numb"),
         ("cameras.txt", "words", "COLMAP, its line is short"),
+        ("o.yaml", ORB_SLAM + "Camera2.fx: 500.0\n", "ORB-SLAM, it holds 2 cameras; leave Camera1"),
+        ("o.yaml", ORB_SLAM.replace("Camera.width", "Width"), "'Camera.width' is missing"),
+        ("v.yaml", VINS.replace("PINHOLE", "MEI"), "VINS, key 'model_type' is 'MEI'"),
+        ("v.yaml", VINS_FISHEYE.replace("   mu", "   nu"), "VINS, key 'mu' is missing"),
+        (
+            "v.yaml",
+            "{model_type: PINHOLE, image_width: 1, image_height: 1, distortion_parameters: 3}",
+            "'distortion_parameters' is '3', which is no list of keys",
+        ),
+        ("s.yaml", OKVIS.replace("camera_params", "     - {}\ncamera_params"), "holds 2 cameras"),
+        ("s.yaml", "cameras: [3]", "OKVIS, it is no list of keys"),
         ("m.xml", "<calibration>", "Metashape or OpenCV, it is damaged XML"),
         ("m.xml", METASHAPE.replace("<f>510</f>", ""), "Metashape or OpenCV, key 'f' is missing"),
     ],
