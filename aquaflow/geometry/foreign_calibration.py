@@ -1,9 +1,9 @@
 """Calibrations as other programs write them, as the values of ``camera.yaml``.
 
-ROS (camera_info_manager), OpenCV's FileStorage, Kalibr's camchain, the settings of ORB-SLAM, VINS
-(camodocal) and OKVIS (SVIn), COLMAP's cameras.txt, Agisoft Metashape's XML and OpenDroneMap's
-cameras.json. COLMAP's, Metashape's and ours put the centre of the first pixel at 0.5; all others
-count pixel centres as integers.
+ROS (camera_info_manager), OpenCV's FileStorage, Kalibr's camchain, files of ORB-SLAM, VINS
+(camodocal), OKVIS (SVIn) and EuRoC, COLMAP's cameras.txt, Agisoft Metashape's XML and
+OpenDroneMap's cameras.json. COLMAP's, Metashape's and ours put the centre of the first pixel at
+0.5; all others count pixel centres as integers.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ MODELS: dict[str, Model] = {
     "equidistant": "fisheye", "kannala_brandt": "fisheye", "kannalabrandt4": "fisheye",
     "fisheye": "fisheye", "plumb_bob": "radtan", "rational_polynomial": "radtan",
     "radtan": "radtan", "opencv": "radtan", "brown": "radtan", "radial": "radtan",
-    "radialtangential": "radtan", "radialtangential8": "radtan", "pinhole": "radtan",
-    "kannalabrandt8": "fisheye", "rectified": "none", "none": "none", "": "none",
+    "radialtangential": "radtan", "radial-tangential": "radtan", "radialtangential8": "radtan",
+    "pinhole": "radtan", "kannalabrandt8": "fisheye", "rectified": "none", "none": "none",
+    "": "none",
 }  # fmt: skip
 """Names of distortion models in other programs: of Kannala and Brandt (2006), which OpenCV calls
 fisheye, and of OpenCV's usual one."""
@@ -78,6 +79,7 @@ def values_of_yaml(path: Path, data: Values) -> Values | None:
         (bool(kalibr), _kalibr, kalibr),
         ("Camera.fx" in data or "Camera1.fx" in data, _orb_slam, data),
         ("model_type" in data, _vins, data),
+        ("intrinsics" in data and "resolution" in data, _euroc, data),
         (isinstance(okvis, list), _okvis, okvis),
         (ros, _ros, data),
         (bool(opencv), _opencv, data),
@@ -155,6 +157,7 @@ def _read(path: Path, reader: Any, content: Any) -> Values:
     name = {
         _xml: "Metashape or OpenCV", _odm: "OpenDroneMap", _colmap: "COLMAP", _kalibr: "Kalibr",
         _ros: "ROS", _opencv: "OpenCV", _orb_slam: "ORB-SLAM", _vins: "VINS", _okvis: "OKVIS",
+        _euroc: "EuRoC",
     }[reader]  # fmt: skip
     try:
         values: Values = reader(content)
@@ -213,11 +216,19 @@ def _opencv(data: Values) -> Values:
 def _kalibr(cameras: list[Values]) -> Values:
     if len(cameras) > 1:
         raise _NotUnderstoodError(f"it holds {len(cameras)} cameras; leave one of them, as cam0")
-    keys = _Keys(cameras[0])
+    return _pinhole(_Keys(cameras[0]), "distortion_coeffs")
+
+
+def _euroc(data: Values) -> Values:
+    """The ``sensor.yaml`` of a camera in EuRoC's layout."""
+    return _pinhole(_Keys(data), "distortion_coefficients")
+
+
+def _pinhole(keys: _Keys, distortion: str) -> Values:
     if (model := keys.value("camera_model")) != "pinhole":
         raise _NotUnderstoodError(f"key 'camera_model' is {_quote(model)}, which is not known")
     fx, fy, cx, cy = keys.numbers("intrinsics", 4)[:4]
-    size, d = keys.numbers("resolution", 2), keys.numbers("distortion_coeffs")
+    size, d = keys.numbers("resolution", 2), keys.numbers(distortion)
     return _values(size, _at_half(fx, fy, cx, cy), keys.model("distortion_model"), d)
 
 

@@ -36,8 +36,12 @@ TIMESTAMPS = "timestamps.txt"
 """One time in seconds for each picture."""
 CALIBRATION = "camera.yaml"
 """The camera, if it is known."""
+SENSOR = "sensor.yaml"
+"""The camera in a folder of EuRoC's layout."""
 SUBFOLDER = "images"
-"""The pictures may be in this folder of the one that is named; so may both files."""
+SUBFOLDERS = (SUBFOLDER, "data")
+"""The pictures may be in such a folder of the one that is named, and so may the files beside them;
+EuRoC's is ``data``."""
 
 MOST_NAMED = 8
 """Names that are said of what lies in a folder."""
@@ -70,7 +74,7 @@ class ImageFolder:
         self.width, self.height = self._majority_size()
         stamps = _sidecar(folder, TIMESTAMPS)
         self._times_ns, self._facts["times"] = _times_ns(stamps, self.files, fps)
-        calibration = _sidecar(folder, CALIBRATION)
+        calibration = _sidecar(folder, CALIBRATION) or _sidecar(folder, SENSOR)
         self.camera: CameraModel | None = load_camera(calibration) if calibration else None
         if calibration is not None:
             self._facts["calibration"] = f"the calibration is {calibration}"
@@ -217,8 +221,8 @@ class StillsTelemetry:
 
 
 def _pictures_of(folder: Path) -> list[Path]:
-    """Picture files of ``folder``, or of its ``images`` folder, in natural order."""
-    for place in (folder, folder / SUBFOLDER):
+    """Picture files of ``folder``, or of one of its ``SUBFOLDERS``, in natural order."""
+    for place in (folder, *(folder / name for name in SUBFOLDERS)):
         found = [
             file
             for file in (place.iterdir() if place.is_dir() else ())
@@ -246,8 +250,8 @@ def _natural_key(file: Path) -> tuple[list[tuple[int, int, str]], str]:
 
 
 def _sidecar(folder: Path, name: str) -> Path | None:
-    """``name`` in the folder or in its ``images`` folder, if it is there."""
-    for place in (folder, folder / SUBFOLDER):
+    """``name`` in the folder or in one of its ``SUBFOLDERS``, if it is there."""
+    for place in (folder, *(folder / name for name in SUBFOLDERS)):
         if (place / name).is_file():
             return place / name
     return None
@@ -298,6 +302,9 @@ def _times_ns(stamps: Path | None, files: list[Path], fps: float | None) -> tupl
         return times, f"the times of the pictures are those of {stamps}"
     if fps is not None:
         return _evenly(len(files), fps), f"the pictures have the {fps:g} a second that were given"
+    if (listed := _listed_times(files)) is not None:
+        path, times = listed
+        return times, f"the times of the pictures are those of {path}"
     if (named := _increasing(time_of_name(file.stem) for file in files)) is not None:
         kind, times = named
         return times, f"the times of the pictures are the {kind} in their names"
@@ -327,6 +334,80 @@ def _increasing(times: Iterable[tuple[str, int] | None]) -> tuple[str, list[int]
     if any(after <= before for before, after in pairwise(ns)):
         return None
     return known[0][0], [time - ns[0] for time in ns]
+
+
+LISTS = (".csv", ".txt")
+"""Endings of a table that names each picture and its time, beside the pictures or above them, such
+as EuRoC's ``data.csv`` and TUM's ``rgb.txt``."""
+LARGEST_LIST = 64 * 1024 * 1024
+"""Bytes: a million pictures and more; a larger file is something else."""
+TIME_WORD = re.compile(r"time|stamp", re.IGNORECASE)
+"""In the header's name of the times."""
+DECIMAL = re.compile(r"\d{1,19}(\.\d*)?")
+UNIT = re.compile(r"[\[(_](ns|us|ms|s)(?![a-z])")
+"""The unit of times in a header."""
+UNITS_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": NS_PER_S}
+EPOCH_UNITS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))
+"""Numbers from which on a time since 1970 has this unit: seconds have ten digits."""
+SECONDS_SINCE_1970 = 10**9
+"""In September 2001."""
+
+
+def _listed_times(files: list[Path]) -> tuple[Path, list[int]] | None:
+    """The first table that has a time for every picture, each after the one before, and these in ns
+    since the first."""
+    places = (files[0].parent, files[0].parent.parent)
+    tables = [path for place in places for path in sorted(place.glob("*")) if _may_list(path)]
+    for path in tables:
+        found = _times_of_list(path)
+        times = [found[file.name] for file in files if file.name in found]
+        if len(times) == len(files) and all(after > before for before, after in pairwise(times)):
+            return path, [time - times[0] for time in times]
+    return None
+
+
+def _may_list(path: Path) -> bool:
+    return path.suffix.lower() in LISTS and path.is_file() and path.stat().st_size <= LARGEST_LIST
+
+
+def _times_of_list(path: Path) -> dict[str, int]:
+    """Time in ns of each picture that a line of the table names."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return {}
+    times: dict[str, int] = {}
+    column, unit = None, None
+    for line in lines:
+        words = _words_of(line)
+        names = [Path(word).name for word in words if Path(word).suffix.lower() in EXTENSIONS]
+        if names:
+            time_ns = _in_ns(words if column is None else words[column : column + 1], unit)
+            if time_ns is not None:
+                times[names[0]] = time_ns
+        elif column is None and not times:
+            column = next((n for n, word in enumerate(words) if TIME_WORD.search(word)), None)
+            unit = stated[1] if (stated := UNIT.search(line)) else None
+    return times
+
+
+def _words_of(line: str) -> list[str]:
+    line = line.lstrip("# ")
+    separated = re.split(r"[,;\t]", line) if re.search(r"[,;\t]", line) else line.split()
+    return [word.strip("\"' ") for word in separated]
+
+
+def _in_ns(words: list[str], unit: str | None) -> int | None:
+    """The first number, in ns; without a header it must be a time since 1970, because a number of
+    the picture or a place is none."""
+    for word in words:
+        if DECIMAL.fullmatch(word):
+            whole, _, decimals = word.partition(".")
+            usual = next((name for least, name in EPOCH_UNITS if int(whole) >= least), "s")
+            scale = UNITS_NS[unit or usual]
+            if len(words) == 1 or int(whole) >= SECONDS_SINCE_1970:
+                return int(whole) * scale + _decimals_ns(decimals[:9]) * scale // NS_PER_S
+    return None
 
 
 def _read_stamps(path: Path) -> list[float]:

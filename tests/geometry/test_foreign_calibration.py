@@ -112,6 +112,19 @@ cameras:
 camera_params:
      camera_rate: 20
 """
+EUROC = """
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: [500, 510, 319.5, 239.5] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.3, 0.1, 0.001, -0.002]
+"""
 FULL = "1 FULL_OPENCV 640 480 500 510 320 240 -0.3 0.1 0.001 -0.002 0.02 0 0 0"
 
 FILES = {
@@ -124,8 +137,9 @@ FILES = {
     "orb_slam2.yaml": ORB_SLAM.replace("Camera1.", "Camera.").replace('Camera.type: "PinHole"', ""),
     "vins.yaml": VINS,
     "okvis.yaml": OKVIS,
+    "sensor.yaml": EUROC,
 }
-FOUR_NUMBERS = ("kalibr.yaml", "okvis.yaml")
+FOUR_NUMBERS = ("kalibr.yaml", "okvis.yaml", "sensor.yaml")
 """Files whose distortion has no k3."""
 
 

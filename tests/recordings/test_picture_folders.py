@@ -74,3 +74,59 @@ def test_colours_of_16_bits_keep_their_order(tmp_path: Path) -> None:
     (frame,) = ImageFolder(tmp_path).frames()
     assert isinstance(frame, Frame)
     assert frame.image[0, 0].tolist() == [255, 0, 0]
+
+
+LISTS = [
+    ("#timestamp [ns],filename\n1403636579763555584,{}\n1403636579813555456,{}\n", 0.049999872),
+    ("#timestamp [ns],filename\n100000000,{}\n250000000,{}\n", 0.15),
+    ("# color images\n# file: 'a.bag'\n# timestamp filename\n1305031102.1 rgb/{}\n"
+     "1305031102.4 rgb/{}\n", 0.3),
+    ("name,time (ms)\n{},100\n{},250\n", 0.15),
+    ("{};1700000000123\n{};1700000000623\n", 0.5),
+    ('"file","quality","time_s"\r\n"{}","7","12.5"\r\n"{}","3","13"\r\n', 0.5),
+    ("1403636579763555584 {}\n1403636579813555456 {}\n", 0.049999872),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "expected_s"), LISTS)
+@pytest.mark.parametrize("above", [False, True])
+def test_a_table_that_names_the_pictures_has_their_times(
+    tmp_path: Path, text: str, expected_s: float, above: bool
+) -> None:
+    pictures = tmp_path / "data"
+    pictures.mkdir()
+    folder_of(pictures, names := ["frame_1.png", "frame_2.png"])
+    table = (tmp_path if above else pictures) / "list.csv"
+    table.write_text(text.format(*names))
+    camera = ImageFolder(tmp_path)
+    assert [f.t_ns * 1e-9 for f in camera.frames()] == pytest.approx([0.0, expected_s], abs=1e-9)
+    assert camera.notes[0] == f"the times of the pictures are those of {table}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,1.png\n1,2.png\n",
+        "file,latitude,longitude\n1.png,-41.25,174.8\n2.png,-41.24,174.9\n",
+        "time,file\n1.0,1.png\n",
+        "time,file\n2.0,1.png\n1.0,2.png\n",
+        "1.png\n2.png\n",
+        "\xff",
+    ],
+)
+def test_a_table_without_a_time_for_each_picture_is_left_alone(tmp_path: Path, text: str) -> None:
+    (tmp_path / "list.csv").write_bytes(text.encode("latin-1"))
+    camera = folder_of(tmp_path, ["1.png", "2.png"])
+    assert "10 a second are assumed" in camera.notes[0]
+
+
+def test_a_camera_of_eurocs_layout_is_read_with_its_calibration(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    folder_of(tmp_path / "data", ["1403636579763555584.png", "1403636579813555456.png"])
+    (tmp_path / "sensor.yaml").write_text(
+        "resolution: [48, 32]\ncamera_model: pinhole\nintrinsics: [40, 41, 23.5, 15.5]\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n"
+    )
+    camera = ImageFolder(tmp_path).camera
+    assert camera is not None
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 41, 24, 16)
