@@ -24,6 +24,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.white_balance import DAYLIGHT
 from aquaflow.dive.calibration_pass import FoundCamera
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.fixes_csv import fix_rows
 from aquaflow.dive.folder import IN_SITE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
@@ -215,6 +216,7 @@ class Deliverables:
         attempt = self._attempt
         attempt("writing trajectory.tum", self._write_trajectory)
         attempt("writing trajectory.csv", self._write_path_table)
+        attempt("writing fixes.csv", self._write_fixes)
         attempt("writing metric.json", self._write_metric_file)
         attempt("writing georeference.json", self._write_georeference)
         attempt(f"writing {IN_SITE}", self._write_in_site)
@@ -254,6 +256,11 @@ class Deliverables:
 
     def _write_path_table(self) -> None:
         self.folder.write_path_table(self._path_rows())
+
+    def _write_fixes(self) -> None:
+        rows = fix_rows(self.outputs.frames, self.folder.rows)
+        if rows:
+            self.folder.write_fixes(rows)
 
     def _write_metric_file(self) -> None:
         self.folder.write_metric_frames(self.outputs.frames, self._main)

@@ -17,6 +17,8 @@ from aquaflow.base.errors.regular_file import open_regular_text, read_regular_js
 from aquaflow.base.storage import dive_status
 from aquaflow.base.storage.dive_status import DiveStatus, read_status, refuse_unfinished
 from aquaflow.config import Config, load_config
+from aquaflow.dive.fixes_csv import NAME as FIXES
+from aquaflow.dive.fixes_csv import FixRow, read_fixes_csv
 from aquaflow.dive.frames_csv import FrameRow, read_rows
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.medium import NAME as MEDIUM
@@ -192,6 +194,11 @@ class Dive:
         """Each pose with what telemetry says of it: UTC, depth, attitude, place on the earth; not
         in dives of an older AquaFlow."""
         return read_trajectory_csv(self.file(TRAJECTORY_CSV))
+
+    @cached_property
+    def fixes(self) -> Sequence[FixRow]:
+        """Every position fix that placed the dive, and its error; empty where none did."""
+        return read_fixes_csv(self.file(FIXES)) if self.has(FIXES) else []
 
     def navigation(self) -> list[PoseRow]:
         """The rows of ``trajectory.csv``: UTC, depth, attitude and place on the earth of each pose.

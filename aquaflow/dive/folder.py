@@ -34,6 +34,8 @@ from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive.dive import CALIBRATION, FRAMES
+from aquaflow.dive.fixes_csv import NAME as FIXES
+from aquaflow.dive.fixes_csv import FixRow, write_fixes_csv
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
@@ -70,7 +72,7 @@ DELIVERABLES = (
     *("trajectory.tum", "camera.yaml", "map*.ply", "map*.aqf", "medium.json", SUGGESTED, IN_SITE),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     *("coverage.npz", "coverage.json", "coverage.png", "overview.png"),
-    *("metric.json", "trajectory.csv", "georeference.json", "places.npz"),
+    *("metric.json", "trajectory.csv", FIXES, "georeference.json", "places.npz"),
     *("reef_numbers.csv", "reef_numbers.json"),
 )
 """What is written at the end of a run, and of a live dive partly while it goes on."""
@@ -277,6 +279,10 @@ class DiveFolder:
     def write_path_table(self, rows: Sequence[PoseRow]) -> None:
         """trajectory.csv."""
         write_trajectory_csv(self.path / PATH_TABLE, rows)
+
+    def write_fixes(self, rows: Sequence[FixRow]) -> None:
+        """fixes.csv."""
+        write_fixes_csv(self.path / FIXES, rows)
 
     def write_metric_frames(self, frames: Mapping[int, WorldFrame], main: int) -> None:
         """metric.json; ``main`` is the largest sub-map."""

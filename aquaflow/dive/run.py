@@ -20,6 +20,7 @@ from aquaflow.config.stage import StageConfig
 from aquaflow.dive import calibration_pass
 from aquaflow.dive.calibration_pass import FoundCamera, from_keyframes, in_words
 from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
+from aquaflow.dive.fixes_csv import fix_numbers
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.metric_outputs import (
@@ -417,6 +418,7 @@ class DiveRun:
         wall_s = time.monotonic() - self.started
         numbers = metrics(self.slam, results, self.dropped, made.held_out, wall_s)
         numbers |= frame_numbers(made.metric_frame) | utc_numbers(made.outputs.navigation)
+        numbers["fixes"] = fix_numbers(made.outputs.frames)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["calibration_check"] = self.calibration_numbers
         numbers["self_calibration"] = None if self.found is None else self.found.to_json()

@@ -17,7 +17,7 @@ from aquaflow.optimise.least_squares import covariance_of
 from aquaflow.telemetry.building import problem_of
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.device_clocks import DeviceClocks
-from aquaflow.telemetry.factors import Factor
+from aquaflow.telemetry.factors import Factor, PositionFactor
 from aquaflow.telemetry.solve import Carried, Solution, TelemetryProblem, solve
 from aquaflow.telemetry.start import WHITE, Noise, camera_in_body
 from aquaflow.telemetry.state import CLOCK, SCALE, SHIFT, TURN
@@ -27,6 +27,7 @@ from aquaflow.telemetry.world_frame import (
     LARGEST_TILT_SIGMA,
     MAP_UNIT,
     UNKNOWN_SIGMA,
+    FixErrors,
     North,
     SourceReport,
     WorldFrame,
@@ -151,7 +152,7 @@ def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) ->
     upright = level or problem.on_ground
     if not upright:
         T_nm = Sim3(np.eye(3), np.zeros(3), T_nm.scale)
-    return WorldFrame(
+    frame = WorldFrame(
         T_nm,
         covariance,
         metric=metric,
@@ -163,6 +164,15 @@ def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) ->
         T_bc=Sim3(state.R_bc, state.c_b) if problem.mounted else None,
         scale_source=_scale_source(problem, solution, path, scale_sigma),
         sources=(*_reports(problem, solution), *problem.reports),
+    )
+    return replace(frame, fixes=_fix_errors(problem, solution)) if frame.georeferenced else frame
+
+
+def _fix_errors(problem: TelemetryProblem, solution: Solution) -> tuple[FixErrors, ...]:
+    return tuple(
+        factor.errors_of_all(solution.state, kept)
+        for factor, kept in zip(problem.factors, solution.kept, strict=True)
+        if isinstance(factor, PositionFactor) and factor.kind == "position"
     )
 
 

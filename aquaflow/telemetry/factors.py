@@ -30,6 +30,7 @@ from aquaflow.telemetry.state import (
     P,
 )
 from aquaflow.telemetry.telemetry import Series
+from aquaflow.telemetry.world_frame import FixErrors
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -455,16 +456,30 @@ class PositionFactor(Factor):
         path: CameraPath,
     ) -> None:
         """``path`` covers all fixes."""
-        step = max(1, -(-len(t_s) // MOST))
-        self.source, self.t_s, self.sigma = source, t_s[::step], sigma[::step]
-        self._fixes_n = fixes_n[::step]
+        self._step = max(1, -(-len(t_s) // MOST))
+        self.source, self.t_s, self.sigma = source, t_s[:: self._step], sigma[:: self._step]
+        self._fixes_n = fixes_n[:: self._step]
         self._R_mc, self._p_m = path.at(self.t_s)
         self._v_m = path.velocity(self.t_s)
+        self._every = t_s, fixes_n, sigma, path
 
     def residuals(self, state: MetricState) -> Array:
         """[N, 2] m."""
         _, p_n = state.body(self._R_mc, self._p_m - state.lag_s * self._v_m)
         return np.asarray(p_n[:, :2] - self._fixes_n)
+
+    def errors_of_all(
+        self,
+        state: MetricState,
+        kept: npt.NDArray[np.bool_],  # [n] of the fixes that took part
+    ) -> FixErrors:
+        """Of every fix, those included that the estimate did without."""
+        t_s, fixes_n, sigma, path = self._every
+        R_mc, p_m = path.at(t_s)
+        _, p_n = state.body(R_mc, p_m - state.lag_s * path.velocity(t_s))
+        rejected = np.zeros(len(t_s), bool)
+        rejected[:: self._step] = ~kept
+        return FixErrors(self.source, t_s, fixes_n, sigma, p_n[:, :2] - fixes_n, rejected)
 
 
 class PlaceFactor(PositionFactor):

@@ -69,6 +69,33 @@ class Origin:
 
 
 @dataclass(frozen=True)
+class FixErrors:
+    """Where the fit leaves the path at every position fix of one source, less the fix."""
+
+    source: str
+    t_s: Array
+    """[N] s of the dive's clock."""
+    fixes_n: Array
+    """[N, 2] m north and east of n's origin."""
+    sigma_m: Array
+    """[N] 1 sigma of each horizontal direction, as the fix states it."""
+    errors_n: Array
+    """[N, 2] m north and east: the body in the dive less the fix."""
+    rejected: npt.NDArray[np.bool_]
+    """[N] fixes that contradicted those around them, and took no part."""
+
+    @property
+    def errors_m(self) -> Array:
+        """[N] horizontal distances."""
+        return np.asarray(np.linalg.norm(self.errors_n, axis=1))
+
+    @property
+    def in_sigmas(self) -> Array:
+        """[N] root mean square of the two directions over the stated sigma."""
+        return np.asarray(self.errors_m / (np.sqrt(2.0) * self.sigma_m))
+
+
+@dataclass(frozen=True)
 class WorldFrame:
     """The similarity from a sub-map's world m to n, its covariance, and what is known of it."""
 
@@ -89,6 +116,9 @@ class WorldFrame:
     scale_source: str = ""
     """Devices that the scale comes from, or why there is none."""
     sources: tuple[SourceReport, ...] = ()
+    fixes: tuple[FixErrors, ...] = ()
+    """Of each source of fixes, where it is georeferenced; a frame that was read back has none, as
+    fixes.csv keeps them."""
     clock_offset_s: float = 0.0
     """Pictures' time less that of telemetry's stamps, as rotations show it now and as it was
     corrected; 0 where none was found."""

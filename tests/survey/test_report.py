@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from aquaflow.dive.fixes_csv import FixRow
 from aquaflow.survey.report.data import (
     CameraSummary,
     HeldOutExample,
@@ -228,3 +229,28 @@ def test_the_grounds_numbers_stand_with_their_intervals() -> None:
     assert "1.23 to 1.27" in page
     assert "on cells of &lt;0.1&gt; m" in page
     assert "The ground in numbers" not in render_report(report())
+
+
+def test_fixes_are_drawn_and_listed_and_of_many_the_worst() -> None:
+    fix = FixRow(0.0, "<1>.jpg", "usbl", 0, -31.7, 115.0, 0.05, 0.04, -0.03, 0.05, 0.7, False)
+    metrics = {
+        "fixes": {"count": 9, "rejected": 1, "rms_m": 0.0512, "largest_m": 0.2, "rms_sigmas": 0.9}
+    }
+    fixes = [replace(fix, t_s=float(k), longitude_deg=115.0 + 1e-5 * k) for k in range(8)]
+    fixes.append(replace(fix, picture="far.jpg", error_m=3.0, error_east_m=3.0, rejected=True))
+    page = render_report(report(fixes=fixes, metrics=metrics))
+    for text in ("&lt;1&gt;.jpg", "+0.040", "RMS 0.0512 m", "From each fix", "<td>rejected</td>"):
+        assert text in page, text
+    parser = Balance()
+    parser.feed(page)
+    assert parser.wrong == []
+    many = [*fixes, *(replace(fix, picture="near.jpg", error_m=0.01) for _ in range(40))]
+    page = render_report(report(fixes=many, metrics=metrics))
+    assert page.count("<td>near.jpg</td>") == 31
+    assert "<td>far.jpg</td>" in page
+    assert "Position fixes" not in render_report(report())
+
+
+def test_one_fix_that_is_exact_is_drawn() -> None:
+    fix = FixRow(0.0, "", "gps", 0, 0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 0.0, False)
+    assert "<td>0.00 s</td>" in render_report(report(fixes=[fix]))

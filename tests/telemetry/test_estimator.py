@@ -16,6 +16,7 @@ from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
+from aquaflow.telemetry.factors import MOST
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.world_frame import SourceReport
 from aquaflow.types import (
@@ -337,6 +338,25 @@ def test_positions_alone_level_the_map_at_an_assumed_constant_depth() -> None:
     assert report(found, "constant_depth").source == "assumed"
     loose = of_fixes(lawn, depth_change_sigma_m=10.0)
     assert not loose.frame.level
+
+
+def test_every_fix_has_its_error_and_the_wrong_ones_are_marked(dive: Swum) -> None:
+    """Also those beyond the number that the estimate takes."""
+    fixes = fixes_of(dive, 1)
+    assert len(fixes) > MOST
+    wrong = [60, 150]
+    for k in wrong:
+        assert isinstance(fixes[k], Position)
+        fixes[k] = replace(fixes[k], latitude_deg=fixes[k].latitude_deg + 5.0 / 111_000.0)
+    made = telemetry([*fixes, *(s for s in dive.dive.samples if isinstance(s, Depth))])
+    settings = FusionConfig(position_lag_sigma_s=0.0)
+    found = estimate(made, dive.path, settings, None, lambda: NOTHING)
+    (errors,) = found.frame.fixes
+    assert len(errors.t_s) == len(fixes)
+    assert np.median(errors.errors_m) < 0.1
+    np.testing.assert_allclose(errors.errors_n[wrong, 0], -5.0, atol=0.5)
+    step = -(-len(fixes) // MOST)
+    assert set(np.flatnonzero(errors.rejected)) == {k for k in wrong if k % step == 0}
 
 
 def test_positions_and_depth_level_the_map_without_any_assumption(dive: Swum) -> None:

@@ -161,3 +161,14 @@ def test_fixes_alone_place_a_survey_on_the_earth(
     found, true = found - found.mean(), true - true.mean()
     assert np.sqrt(np.mean(np.abs(found - true) ** 2)) < 0.02 * np.abs(np.diff(true)).sum()
     assert abs(np.degrees(np.angle(np.vdot(found, true)))) < 2.0
+    fixes = read_dive(dive).fixes
+    assert [fix.picture for fix in fixes] == [row.source for row in read_dive(dive).frames]
+    errors = np.array([(fix.error_north_m, fix.error_east_m) for fix in fixes]) @ (1.0, 1.0j)
+    np.testing.assert_allclose(errors - errors.mean(), found - true, atol=0.03)
+    numbers = read_dive(dive).metrics["fixes"]
+    assert (numbers["count"], numbers["rejected"]) == (len(rows), 0)
+    assert numbers["rms_m"] == pytest.approx(np.sqrt(np.mean(np.abs(errors) ** 2)), abs=1e-3)
+    assert numbers["rms_sigmas"] < 1.5
+    report = (dive / "report.html").read_text()
+    assert "<h2>Position fixes</h2>" in report
+    assert all(f"<td>{fix.picture}</td>" in report for fix in fixes)

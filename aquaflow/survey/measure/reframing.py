@@ -23,6 +23,7 @@ from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.base.storage.dive_status import rescaling
 from aquaflow.dive import trajectory_csv
 from aquaflow.dive.dive import HELD_OUT, METRICS, TRAJECTORY, Dive
+from aquaflow.dive.fixes_csv import NAME as FIXES
 from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.dive.metric_outputs import (
     attitude_of,
@@ -153,13 +154,14 @@ def reframe(dive: Dive, sub_map: int, after: WorldFrame) -> None:
     if sub_map == main:
         dive.require(METRICS)
         notes = moved_notes(read_notes(folder, before), change)
-        texts[METRICS] = dive.metrics | frame_numbers(after)
+        texts[METRICS] = dive.metrics | frame_numbers(after) | {"fixes": None}
         if dive.medium_facts:
             texts[MEDIUM] = _medium(deepcopy(dive.medium_facts), after, times)
     placed = georeference(frames, main)
     if placed is not None:
         texts[GEOREFERENCE] = placed
     with rescaling(folder):
+        dive.file(FIXES).unlink(missing_ok=True)  # errors of the frame before
         for ply, each in splats.items():
             write_ply(ply, each.transform(change))
         write_trajectory_csv(folder / trajectory_csv.NAME, table)

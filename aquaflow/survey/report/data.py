@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.fixes_csv import FixRow
 from aquaflow.dive.medium import Rgb
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.export.ortho.ground import ALONG_GRAVITY
@@ -153,6 +154,8 @@ class ReportData:
     """``metrics.json``."""
     path: PathPlot | None = None
     measures: Measures | None = None
+    fixes: Sequence[FixRow] = ()
+    """Of fixes.csv."""
     reef: list[ReefRow] = field(default_factory=list)
     timeline: list[str] = field(default_factory=list)
     """Class of every frame in order, also ``skipped``, ``lost`` and ``dropped``."""

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.fixes_csv import FixRow
+from aquaflow.geometry.earth import north_east
 from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.picture import cells_affine
@@ -335,3 +337,56 @@ def profile_axes(figure: Figure, profile: DepthProfile) -> None:
         axes.set_ylabel(profile.unit)
         if down:
             axes.invert_yaxis()
+
+
+# --------------------------------------------------------------------------------------------------
+# Position fixes, and an arrow from each to where the dive lies.
+
+REJECTED_COLOUR = "#e8505b"
+LONGEST_ARROW = 0.15
+"""Of the larger side of the plan: the longest arrow of a fix that was used, at most; those of
+rejected fixes run out of the plan."""
+ROUND_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""By which arrows may be drawn too long."""
+
+
+def fixes_svg(fixes: Sequence[FixRow]) -> str:
+    """The fixes in plan view."""
+    return svg_of(draw(9.0, 4.6, fixes_axes, fixes), "fixes")
+
+
+def fixes_axes(figure: Figure, fixes: Sequence[FixRow]) -> None:
+    """Draw fixes and their errors, north up, into an empty figure."""
+    from matplotlib.lines import Line2D
+
+    latitudes, longitudes = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes]).T
+    middle = float(latitudes.mean()), float(longitudes.mean())
+    places = north_east(latitudes, longitudes, middle)[:, ::-1]
+    errors = np.array([(fix.error_east_m, fix.error_north_m) for fix in fixes])
+    rejected = np.array([fix.rejected for fix in fixes])
+    used = errors if rejected.all() else errors[~rejected]
+    size = float(np.ptp(places, axis=0).max())
+    longest = LONGEST_ARROW * size / max(float(np.linalg.norm(used, axis=1).max()), 1e-9)
+    times = max(factor for factor in ROUND_FACTORS if factor <= max(longest, 1.0))
+    axes = figure.subplots()
+    handles = []
+    for chosen, colour, label in (
+        (~rejected, SUB_MAP_COLOURS[0], "fix that was used"),
+        (rejected, REJECTED_COLOUR, "fix that was rejected"),
+    ):
+        if chosen.any():
+            ends = places[chosen] + times * errors[chosen]
+            axes.plot(*np.stack([places[chosen], ends]).transpose(2, 0, 1), color=colour, lw=1.4)
+            axes.plot(*places[chosen].T, "o", ms=4.0, color=colour)
+            handles.append(Line2D([], [], color=colour, marker="o", ms=4.0, label=label))
+    axes.set_aspect("equal", adjustable="box")
+    low, high = places.min(axis=0), places.max(axis=0)
+    room = max(1.5 * LONGEST_ARROW * size, 0.1)
+    axes.set_xlim(low[0] - room, high[0] + room)
+    axes.set_ylim(low[1] - room, high[1] + room)
+    scale = f", drawn {times} times as long" if times > 1 else ""
+    title = _folded_title(figure, f"From each fix to where the dive lies{scale}")
+    figure.suptitle(title, fontsize=TITLE_PT, weight="bold")
+    axes.set_xlabel("east, m")
+    axes.set_ylabel("north, m")
+    add_legend(figure, handles)

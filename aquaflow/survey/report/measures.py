@@ -1,11 +1,13 @@
-"""The report's sections on the ground, on metres, gravity and north, and on telemetry."""
+"""The report's sections on the ground, on metres, gravity and north, on telemetry and fixes."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Sequence
 
-from aquaflow.survey.report.data import Measures, ReefRow
+from aquaflow.dive.fixes_csv import FixRow
+from aquaflow.survey.report.data import Measures, ReefRow, ReportData
+from aquaflow.survey.report.figures import fixes_svg
 from aquaflow.telemetry.world_frame import SourceReport
 
 
@@ -56,3 +58,71 @@ def _sources(sources: Sequence[SourceReport]) -> str:
         'why.</p><table><tr><th>source</th><th>kind</th><th class="n">used</th>'
         f'<th class="n">rejected</th><th>why</th></tr>{rows}</table>'
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# Position fixes and their errors, as surveyors judge a survey.
+
+MOST_FIXES = 40
+"""Rows of the table; of more fixes those with the largest errors, as fixes.csv has all."""
+FIX_COLUMNS = (
+    ("fix", False), ("source", False), ("east, m", True), ("north, m", True), ("error, m", True),
+    ("sigmas", True), ("", False),
+)  # fmt: skip
+"""Each with whether it has numbers."""
+FixCells = tuple[str, str, str, str, str, str, str]
+
+
+def fixes(data: ReportData) -> str:
+    """Plan view, then the table."""
+    if not data.fixes:
+        return ""
+    head = "".join(
+        f'<th class="n">{name}</th>' if numeric else f"<th>{name}</th>"
+        for name, numeric in FIX_COLUMNS
+    )
+    body = "".join(_fix_row(cells) for cells in fix_cells(data.fixes))
+    return (
+        f"<section><h2>Position fixes</h2><p>{fix_words(data)}</p>{fixes_svg(data.fixes)}"
+        f"<table><tr>{head}</tr>{body}</table></section>"
+    )
+
+
+def _fix_row(cells: FixCells) -> str:
+    name, source, *numbers, result = (html.escape(cell) for cell in cells)
+    return (
+        f"<tr><td>{name}</td><td>{source}</td>"
+        + "".join(f'<td class="n">{number}</td>' for number in numbers)
+        + f"<td>{result}</td></tr>"
+    )
+
+
+def fix_words(data: ReportData) -> str:
+    """What the errors are, together and of the fixes that are listed."""
+    found = data.metrics.get("fixes") or {}
+    said = "Where the dive lies at each fix, less the fix; horizontally, as fixes have no height."
+    if found.get("rms_m") is not None:
+        used = found["count"] - found["rejected"]
+        said += (
+            f" Of the {used:,} that were not rejected: RMS {found['rms_m']:.3g} m, "
+            f"{found['rms_sigmas']:.2g} of the sigma that they state, largest "
+            f"{found['largest_m']:.3g} m."
+        )
+    if found.get("rejected"):
+        said += f" {found['rejected']:,} contradicted those around them and took no part."
+    if len(data.fixes) > MOST_FIXES:
+        said += f" The {MOST_FIXES} with the largest errors are listed; fixes.csv has all."
+    return said
+
+
+def fix_cells(fixes: Sequence[FixRow]) -> list[FixCells]:
+    """Rows of the table, in the order of time."""
+    chosen = sorted(fixes, key=lambda fix: -fix.error_m)[:MOST_FIXES]
+    return [
+        (
+            fix.picture or f"{fix.t_s:.2f} s", fix.source, f"{fix.error_east_m:+.3f}",
+            f"{fix.error_north_m:+.3f}", f"{fix.error_m:.3f}", f"{fix.error_sigmas:.1f}",
+            "rejected" if fix.rejected else "",
+        )
+        for fix in sorted(chosen, key=lambda fix: fix.t_s)
+    ]  # fmt: skip

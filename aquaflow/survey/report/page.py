@@ -32,6 +32,7 @@ def render_report(data: ReportData) -> str:
         sections.profile(data.profile),
         measures.reef(data.reef),
         measures.measures(data.measures),
+        measures.fixes(data),
         sections.examples(data),
         sections.medium(data),
         sections.water(data.medium),

@@ -19,6 +19,7 @@ from aquaflow.survey.report.figures import (
     GRID,
     STYLE,
     coverage_axes,
+    fixes_axes,
     fold,
     level_axes,
     medium_axes,
@@ -26,6 +27,7 @@ from aquaflow.survey.report.figures import (
     profile_axes,
     text_width_in,
 )
+from aquaflow.survey.report.measures import FIX_COLUMNS, fix_cells, fix_words
 from aquaflow.survey.report.sections import MINIMUM_PATH, TILES
 
 if TYPE_CHECKING:
@@ -90,7 +92,7 @@ def _summary(pages: Pages, data: ReportData) -> None:
 
 
 def _survey(pages: Pages, data: ReportData) -> None:
-    """Coverage, the map from above, and depth over time."""
+    """Coverage, the map from above, depth over time, and position fixes."""
     view = data.coverage
     if view is not None:
         pages.heading("What was seen", sections.coverage_words(view))
@@ -102,6 +104,10 @@ def _survey(pages: Pages, data: ReportData) -> None:
     if data.profile is not None:
         pages.heading("Depth and altitude")
         pages.drawing(PROFILE_IN, profile_axes, data.profile)
+    if data.fixes:
+        pages.heading("Position fixes", fix_words(data))
+        pages.drawing(PLAN_IN, fixes_axes, data.fixes)
+        pages.table([tuple(name for name, _ in FIX_COLUMNS), *fix_cells(data.fixes)])
     if data.reef:
         said = f"Each with 1 sigma and its 95 % interval. Vertical: {data.vertical}."
         pages.heading("The ground in numbers", said)

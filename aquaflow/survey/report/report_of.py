@@ -54,6 +54,7 @@ def report_of(dive: Dive) -> ReportData:
         metrics=metrics,
         path=path,
         measures=measures(path, frame, medium),
+        fixes=dive.fixes,
         reef=[] if dive.is_going_on else _reef(dive),
         timeline=[row.frame_class for row in rows],
         examples=_examples(dive),
