@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -18,6 +19,7 @@ from aquaflow.cli.console import GroupWithDefault, Json, WhiteBalanceOption, pro
 
 if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
+    from aquaflow.dive.point_cloud import PointCloud, PosedView
 
 
 class ExportFormat(StrEnum):
@@ -424,14 +426,31 @@ def _posed_pictures(job: _Job, path: Path, format: ExportFormat) -> tuple[str, d
     from aquaflow.dive.placement import placement
     from aquaflow.dive.restored import export_posed_pictures
     from aquaflow.survey.export.posed_pictures import write_colmap, write_nerfstudio
+    from aquaflow.survey.export.tracks import Tracks, tracks_in_folder
 
-    write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
+    tracks, colmap = Tracks.none(), format is ExportFormat.colmap
+
+    def write(out: Path, views: Sequence[PosedView], cloud: PointCloud) -> None:
+        nonlocal tracks
+        if not colmap:
+            write_nerfstudio(out, views, cloud)
+            return
+        if job.recording is not None:
+            of_tracks = partial(job.bars, "colmap tracks")
+            tracks = tracks_in_folder(out, views, cloud, of_tracks)
+        write_colmap(out, views, cloud, tracks)
+
     count = export_posed_pictures(
         job.dive, path, write, job.recording, job.restored, job.progress(format)
     )
     where = placement(job.dive.frame)
     said = f"Wrote {count} pictures with their poses to {path}{_source(job)}: {where.axes}; "
-    return f"{said}{where.unit}.", {"frames": count, "unit": where.unit, "axes": where.axes}
+    said += f"{where.unit}."
+    facts = {"frames": count, "unit": where.unit, "axes": where.axes}
+    if not colmap:
+        return said, facts
+    drawn = "pictures that are drawn measure nothing" if job.recording is None else None
+    return f"{said}\n{tracks.in_words(drawn)}", facts | tracks.facts()
 
 
 def _geotags(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str, Any]]:

@@ -64,6 +64,11 @@ class PointCloud:
         """The largest coordinate of a point, without its sign; 0 of an empty cloud."""
         return float(np.abs(self._splats.means[self._chosen]).max(initial=0.0))
 
+    def sample(self, most: int) -> Array:
+        """[M, 3] positions of about ``most`` points, evenly from the map's file."""
+        step = max(len(self) // most, 1)
+        return self._splats.means[self._chosen[::step]].astype(np.float64)
+
     def chunks(self) -> Iterator[CloudPoints]:
         """All points, in the order of the map's file."""
         for first in range(0, len(self), CHUNK):

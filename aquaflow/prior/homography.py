@@ -28,9 +28,10 @@ MIN_DENOMINATOR = 1e-6
 def detect(
     grey: Grey,  # [H, W]
     mask: Mask | None = None,  # [H, W] True where the scene is seen
+    most: int = SIFT_FEATURES,
 ) -> Keypoints:
-    """SIFT keypoints; empty where the picture shows nothing."""
-    sift = cv2.SIFT.create(SIFT_FEATURES, contrastThreshold=SIFT_CONTRAST)
+    """The ``most`` SIFT keypoints that are strongest; empty where the picture shows nothing."""
+    sift = cv2.SIFT.create(most, contrastThreshold=SIFT_CONTRAST)
     points, descriptors = sift.detectAndCompute(
         grey, None if mask is None else mask.astype(np.uint8)
     )

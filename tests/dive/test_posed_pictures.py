@@ -207,7 +207,23 @@ def test_the_command_writes_a_folder_in_the_dive(dive: MappedDive, name: str) ->
     asked = ["export", str(dive.path), "--format", name, "--recording", str(dive.recording)]
     result = CliRunner().invoke(app, [*asked, "--json"])
     assert result.exit_code == 0, result.output
-    assert json.loads(result.output) == {
+    said = json.loads(result.output)
+    tracks = {
+        each: said.pop(each) for each in ("tracks", "track_length", "error_px") if each in said
+    }
+    assert said == {
         "out": str(dive.path / name), "frames": 3, "unit": "m", "axes": "x east, y north, z up",
     }  # fmt: skip
+    assert tracks == (
+        {"tracks": 0, "track_length": None, "error_px": None} if name == "colmap" else {}
+    )
     assert "3 pictures" in CliRunner().invoke(app, asked).output
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_the_command_says_why_colmaps_points_have_no_tracks(dive: MappedDive, drawn: bool) -> None:
+    given = ["--restored"] if drawn else ["--recording", str(dive.recording)]
+    ran = CliRunner().invoke(app, ["export", str(dive.path), "--format", "colmap", *given])
+    why = "pictures that are drawn measure nothing" if drawn else "too few keypoints in common"
+    assert "No point has a track: " in ran.output
+    assert why in ran.output

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive.point_cloud import PointCloud, PosedView
 from aquaflow.dive.restored import IMAGES, picture_name
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.survey.export.tracks import Tracks, rows_by
 
 MODEL = Path("sparse") / "0"
 """Where COLMAP, gsplat, nerfstudio and OpenSplat look for the model."""
@@ -26,25 +27,33 @@ PINHOLE = 1
 NO_ERROR = -1.0
 """What COLMAP writes of a point whose reprojection error was not computed."""
 POINT = np.dtype(
-    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
-"""Of points3D.bin, with a track of no observations."""
+"""Of points3D.bin, before the observations of its track."""
+OBSERVATION = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
+"""Of a track."""
+KEYPOINT = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
+"""Of images.bin."""
 
 
-def write_colmap(out: Path, views: Sequence[PosedView], cloud: PointCloud) -> None:
-    """Write ``out/sparse/0``: a camera for each that differs, a pose for each view, the points.
+def write_colmap(
+    out: Path, views: Sequence[PosedView], cloud: PointCloud, tracks: Tracks | None = None
+) -> None:
+    """Write ``out/sparse/0``: a camera for each that differs, a pose for each view, and points:
+    first the ``tracks`` with their observations, then those of the map, which have none.
 
-    World is the upright frame. Points have no tracks: they come from the map, not from matches.
+    World is the upright frame.
 
     Raises:
         InputError: a file cannot be written.
     """
     folder = out / MODEL
     folder.mkdir(parents=True, exist_ok=True)
+    tracks = tracks or Tracks.none()
     numbers = {camera: n for n, camera in enumerate(dict.fromkeys(v.camera for v in views), 1)}
     _write_cameras(folder / "cameras.bin", numbers)
-    _write_images(folder / "images.bin", views, numbers)
-    _write_points(folder / "points3D.bin", cloud)
+    _write_images(folder / "images.bin", views, numbers, tracks)
+    _write_points(folder / "points3D.bin", cloud, tracks)
 
 
 def _write_cameras(path: Path, numbers: dict[CameraModel, int]) -> None:
@@ -55,7 +64,9 @@ def _write_cameras(path: Path, numbers: dict[CameraModel, int]) -> None:
             stream.write(struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy))
 
 
-def _write_images(path: Path, views: Sequence[PosedView], numbers: dict[CameraModel, int]) -> None:
+def _write_images(
+    path: Path, views: Sequence[PosedView], numbers: dict[CameraModel, int], tracks: Tracks
+) -> None:
     with atomic_write(path) as stream:
         stream.write(struct.pack("<Q", len(views)))
         for number, view in enumerate(views, start=1):
@@ -63,19 +74,38 @@ def _write_images(path: Path, views: Sequence[PosedView], numbers: dict[CameraMo
             stream.write(struct.pack("<I7d", number, *T_cu.quaternion, *T_cu.t))
             stream.write(struct.pack("<I", numbers[view.camera]))
             stream.write(picture_name(view.frame_index).encode("ascii") + b"\0")
-            stream.write(struct.pack("<Q", 0))  # keypoints
+            seen = np.flatnonzero(tracks.view == number - 1)
+            keypoints = np.zeros(len(seen), KEYPOINT)
+            keypoints["pixel"], keypoints["point"] = tracks.pixels[seen], tracks.track[seen] + 1
+            stream.write(struct.pack("<Q", len(seen)))
+            stream.write(keypoints.tobytes())
 
 
-def _write_points(path: Path, cloud: PointCloud) -> None:
+def _write_points(path: Path, cloud: PointCloud, tracks: Tracks) -> None:
     with atomic_write(path) as stream:
-        stream.write(struct.pack("<Q", len(cloud)))
-        first = 1
+        stream.write(struct.pack("<Q", len(tracks) + len(cloud)))
+        _write_tracks(stream, tracks)
+        first = len(tracks) + 1
         for points in cloud.chunks():
             rows = np.zeros(len(points.positions), POINT)
             rows["id"] = np.arange(first, first + len(rows))
             rows["xyz"], rows["rgb"], rows["error"] = points.positions, points.colours, NO_ERROR
             stream.write(rows.tobytes())
             first += len(rows)
+
+
+def _write_tracks(stream: IO[bytes], tracks: Tracks) -> None:
+    observations = np.zeros(len(tracks.track), OBSERVATION)
+    observations["image"] = tracks.view + 1
+    for _, rows in rows_by(tracks.view):
+        observations["keypoint"][rows] = np.arange(len(rows))
+    starts = np.searchsorted(tracks.track, np.arange(len(tracks) + 1))
+    points = np.zeros(len(tracks), POINT)
+    points["id"], points["length"] = np.arange(1, len(tracks) + 1), np.diff(starts)
+    points["xyz"], points["rgb"], points["error"] = tracks.points, tracks.colours, tracks.errors
+    for number, point in enumerate(points):
+        stream.write(point.tobytes())
+        stream.write(observations[starts[number] : starts[number + 1]].tobytes())
 
 
 # --------------------------------------------------------------------------------------------------
