@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.lab.synthetic.mounting import Mountings
-from aquaflow.lab.synthetic.path import Path
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -19,11 +18,45 @@ HALF_STEP_S = 1e-3
 """Of the central difference that gives accelerations: 30 times finer than the path's splines."""
 
 
+class BodyPath(Protocol):
+    """Pose of the camera and attitude of the body as functions of time (s); see path.Path."""
+
+    @property
+    def R_ws(self) -> Array:
+        """[3, 3] survey frame in the world."""
+        ...
+
+    @property
+    def t_ws(self) -> Array:
+        """[3] m"""
+        ...
+
+    def centre_w(self, t: Array) -> Array:
+        """[N, 3] m, the camera's centre in the world."""
+        ...
+
+    def velocity_w(self, t: Array) -> Array:
+        """[N, 3] m/s of the camera over ground, in the world."""
+        ...
+
+    def R_wb(self, t: Array) -> Array:
+        """[N, 3, 3] body in the world."""
+        ...
+
+    def R_wc(self, t: Array) -> Array:
+        """[N, 3, 3] camera in the world."""
+        ...
+
+    def rate_b(self, t: Array) -> Array:
+        """[N, 3] rad/s in the body frame."""
+        ...
+
+
 @dataclass(frozen=True)
 class TrueBodyMotion:
     """The body's true motion as a function of time; the world has z down, 0 at the surface."""
 
-    path: Path
+    path: BodyPath
     mountings: Mountings
 
     def R_wb(

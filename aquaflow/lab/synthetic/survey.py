@@ -1,8 +1,9 @@
 """A survey without end: a flat seabed, seen through water, one picture at a time.
 
-A vehicle that keeps its heading goes up and down over lines that overlap, as a mower does, so that
-every line but the first closes loops with the one before. A picture takes some milliseconds and
-depends on its index alone; nothing is kept, so that a dive may be as long as wanted.
+A vehicle that keeps its heading follows a plan (survey_plan.py): up and down over lines that
+overlap, as a mower does, so that every line but the first closes loops with the one before; or a
+dive of an hour with all that befalls one. A picture takes some milliseconds and depends on its
+index alone; nothing is kept, so that a dive may be as long as wanted.
 
 Colour and relief are sums of smooth noise of several sizes. The noise is drawn on lattices whose
 values are hashes of their place: no part of the seabed repeats, and none is stored.
@@ -11,7 +12,7 @@ values are hashes of their place: no part of the seabed repeats, and none is sto
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import cv2
@@ -22,7 +23,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.lab.synthetic.config import WaterType
 from aquaflow.lab.synthetic.sensor import quantise
-from aquaflow.lab.synthetic.water import WATER_TYPES
+from aquaflow.lab.synthetic.survey_plan import Conditions, EndlessLines, SurveyPlan
+from aquaflow.lab.synthetic.water import WATER_TYPES, Medium, Rgb
 from aquaflow.types import Frame
 
 Map: TypeAlias = npt.NDArray[np.float32]
@@ -32,12 +34,10 @@ Box: TypeAlias = tuple[float, float, float, float]
 
 FOCAL_WIDTHS = 0.83
 """Focal length over the picture's width: 62 degrees across, as small underwater cameras have."""
-FPS, SPEED_M_S = 10.0, 0.5
-"""Pictures a second, and a usual speed of a survey."""
+FPS = 10.0
+"""Pictures a second."""
 ALTITUDE_M = 1.6
 """Above the seabed: a picture is 1.9 m wide and 1.4 m high."""
-LINE_M, BETWEEN_LINES_M = 12.0, 0.7
-"""Length of a line (240 pictures), and the way to the next one: half of the picture's height."""
 SWAY_M, SWAY_RAD = (0.04, 0.03, 0.06), (0.03, 0.04, 0.05)
 """Amplitude of the vehicle's unrest along and about x, y and z."""
 SWAY_S = np.array([7.3, 11.9, 17.3, 5.3, 8.9, 13.7])
@@ -56,6 +56,18 @@ INTERSECTIONS = 4
 """Steps of a ray's intersection; each leaves a tenth of the error, as the relief is gentle."""
 NOISE = 0.004
 """Standard deviation of a pixel, of full scale: a byte."""
+AMBIENT = 0.5
+"""Share of the light on the seabed that is daylight, where there are lamps."""
+LAMPS_M = (-0.3, 0.3)
+"""Of the left and the right lamp beside the camera, along x."""
+LAMP_POWER = 4.0
+"""Of the cosine to its axis with which a lamp's light falls off: half at 33 degrees."""
+SILT = (0.3, 0.27, 0.22)
+"""Radiance of a dense cloud, RGB."""
+SILT_SPACING, SILT_DRIFT_S = 0.25, 0.2
+"""Of a cloud's structure, and its drift a second; in focal lengths over the picture."""
+SILT_FIELD = 1 << 20
+"""Number of the clouds' noise, plus the survey's: none of the seabed's."""
 MARGIN = 3
 """Lattice points beyond a piece of the seabed, for the cubic interpolation."""
 
@@ -118,9 +130,15 @@ Fields: TypeAlias = list[tuple[_Noise, float]]
 class SurveyPictures:
     """The pictures of a survey in the order in which they are taken; the area grows with them."""
 
-    def __init__(self, width: int, seed: int = 0, water: WaterType = "coastal_1C") -> None:
-        """Pictures of ``width`` pixels."""
-        self.camera = survey_camera(width)
+    def __init__(
+        self,
+        width: int,
+        seed: int = 0,
+        water: WaterType = "coastal_1C",
+        plan: SurveyPlan | None = None,
+    ) -> None:
+        """Pictures of ``width`` pixels along ``plan``; None: lines without end."""
+        self.camera, self.plan = survey_camera(width), plan or EndlessLines()
         self._seed, self._water = seed, WATER_TYPES[water]
         self._rays = self.camera.unproject(self.camera.pixel_centres()).astype(np.float32)
         self._length = np.linalg.norm(self._rays, axis=-1).astype(np.float32)
@@ -129,6 +147,7 @@ class SurveyPictures:
             [(_Noise(spacing_m, next(numbers)), amplitude) for spacing_m, amplitude in layers]
             for layers in (RELIEF, TEXTURE, TINT)
         )
+        self._silt = _Noise(SILT_SPACING, SILT_FIELD + seed)
 
     def name_of(self, index: int) -> str:
         """A frame's name in the table of frames."""
@@ -145,10 +164,7 @@ class SurveyPictures:
 
     def T_wc(self, index: int) -> Sim3:
         """The true pose of a frame, m; x and y lie in the seabed, z points down to it."""
-        line, along = divmod(index / FPS * SPEED_M_S, LINE_M + BETWEEN_LINES_M)
-        x = min(along, LINE_M)
-        x = LINE_M - x if line % 2 else x
-        y = line * BETWEEN_LINES_M + max(along - LINE_M, 0.0)
+        x, y = self.plan.place(np.array(index / FPS)).tolist()
         sway = np.sin(2.0 * np.pi * index / FPS / SWAY_S)
         turn = so3_exp(sway[3:] * SWAY_RAD)
         return Sim3(turn, np.array([x, y, 0.0]) + sway[:3] * SWAY_M)
@@ -159,10 +175,50 @@ class SurveyPictures:
         tint = _sum(self._tint, x, y, box)
         log_colours = np.stack([brightness + tint, brightness, brightness - tint], axis=-1)
         radiance = np.asarray(SAND, np.float32) * np.exp(log_colours)
-        seen = self._water.compose(radiance, ahead * self._length).astype(np.float32)
+        now = self.plan.conditions(index / FPS)
+        water = replace(
+            self._water,
+            beta_a=_times(now.turbidity, self._water.beta_a),
+            b=_times(now.turbidity, self._water.b),
+        )
+        if now.lamps is None:
+            seen = water.compose(radiance, ahead * self._length).astype(np.float32)
+        else:
+            seen = self._lit_by_lamps(index, radiance, ahead, water, now)
         rng = np.random.default_rng([self._seed, index])
         seen += np.float32(NOISE) * rng.standard_normal(seen.shape, np.float32)
         return quantise(seen)
+
+    def _lit_by_lamps(
+        self,
+        index: int,
+        radiance: Map,  # [H, W, 3]
+        ahead: Map,  # [H, W] lengths of a ray
+        water: Medium,
+        now: Conditions,
+    ) -> Map:
+        """[H, W, 3] of a vehicle with lamps, through all that is in the way."""
+        assert now.lamps is not None
+        across, down = np.moveaxis(self._rays[..., :2], -1, 0)
+        light = np.full(ahead.shape, AMBIENT, np.float32)
+        for level, x in zip(now.lamps, LAMPS_M, strict=True):
+            # On its axis at the survey's altitude a lamp gives half of what daylight leaves.
+            aside = across * ahead - np.float32(x)
+            squared = aside**2 + (down * ahead) ** 2 + ahead**2
+            cosine = ahead**2 / squared
+            share = level * (1.0 - AMBIENT) / len(LAMPS_M) * ALTITUDE_M**2
+            light += np.float32(share) * cosine ** np.float32(LAMP_POWER / 2.0) / squared
+        mean = AMBIENT + (1.0 - AMBIENT) * sum(now.lamps) / len(now.lamps)
+        water = water.under(mean)
+        seen = water.compose(radiance * light[..., None], ahead * self._length)
+        if now.silt > 0.0:
+            drift = np.float32(index / FPS * SILT_DRIFT_S)
+            x, y = across + drift, np.ascontiguousarray(down)
+            box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
+            hidden = now.silt * np.clip(0.6 + 0.7 * self._silt(x, y, box), 0.0, 0.97)[..., None]
+            seen = (1.0 - hidden) * seen + hidden * np.asarray(SILT, np.float32)
+        seen = (1.0 - now.veil) * seen + now.veil * np.asarray(water.B_inf, np.float32)
+        return np.asarray(now.light * seen, np.float32)
 
     def _intersect_seabed(self, T_wc: Sim3) -> tuple[Map, Map, Map, Box]:
         """[H, W] each: x and y in m of where a pixel's ray meets the seabed, and how many of its
@@ -178,6 +234,11 @@ class SurveyPictures:
             x, y = x0 + ahead * along_x, y0 + ahead * along_y
             ahead = (ALTITUDE_M + _sum(self._relief, x, y, box) - z0) / down
         return x, y, ahead, box
+
+
+def _times(factor: float, rgb: Rgb) -> Rgb:
+    red, green, blue = rgb
+    return factor * red, factor * green, factor * blue
 
 
 def _sum(

@@ -7,14 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.lab.synthetic.survey import (
-    ALTITUDE_M,
-    BETWEEN_LINES_M,
-    FPS,
-    LINE_M,
-    SPEED_M_S,
-    SurveyPictures,
-)
+from aquaflow.lab.synthetic.survey import ALTITUDE_M, FPS, SurveyPictures
+from aquaflow.lab.synthetic.survey_plan import BETWEEN_LINES_M, LINE_M, SPEED_M_S
 
 WIDTH = 96
 ON_A_LINE = round(LINE_M / SPEED_M_S * FPS)

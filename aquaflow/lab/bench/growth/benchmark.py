@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.lab.bench import machine
-from aquaflow.lab.bench.growth.job import GrowthJob
+from aquaflow.lab.bench.growth.job import GrowthJob, Instruments
 from aquaflow.lab.bench.picture import COLOURS
 from aquaflow.lab.bench.runner import answer_of
+from aquaflow.lab.synthetic.survey_plan import SurveyScene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,17 +62,29 @@ def bench_growth(
 
 
 def jobs_of(
-    frames: Sequence[int], width: int, preset: str, tracking_only: bool, out: Path
+    frames: Sequence[int],
+    width: int,
+    preset: str,
+    tracking_only: bool,
+    out: Path,
+    scene: SurveyScene = "lines",
+    telemetry: Instruments = "none",
+    settings: Path | None = None,
 ) -> list[GrowthJob]:
     """A job for each number of frames, the shortest first.
 
     Raises:
+        InputError: the file of ``settings`` cannot be read.
         ArgumentError: a survey is too short for a map, or there is no such preset.
     """
     if min(frames) < LEAST_FRAMES:
         raise ArgumentError(f"--frames {min(frames)} is too short; give at least {LEAST_FRAMES}")
+    written = None if settings is None else str(settings)
     jobs = [
-        GrowthJob(count, width, str(out / f"dive_{count}"), preset, tracking_only)
+        GrowthJob(
+            count, width, str(out / f"dive_{count}"), preset, tracking_only, scene, telemetry,
+            written,
+        )
         for count in sorted(set(frames))
     ]
     jobs[0].config()

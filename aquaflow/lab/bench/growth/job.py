@@ -4,9 +4,21 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
 
 from aquaflow.config import Config
 from aquaflow.config.presets import load_configured
+from aquaflow.lab.synthetic.streams import Instrument
+from aquaflow.lab.synthetic.survey_plan import SurveyScene
+
+Instruments = Literal["none", "attitude", "dvl"]
+"""What is aboard beside the camera."""
+ABOARD: dict[Instruments, tuple[Instrument, ...]] = {
+    "none": (),
+    "attitude": ("depth", "attitude"),
+    "dvl": ("depth", "attitude", "velocity"),
+}
 
 THREADS = 1
 """CPU time is the work done then, whatever else the machine does; and what is spent outside of the
@@ -23,15 +35,21 @@ class GrowthJob:
     """Dive folder."""
     preset: str
     tracking_only: bool = False
+    scene: SurveyScene = "lines"
+    telemetry: Instruments = "none"
+    settings: str | None = None
+    """Configuration file below the preset; None: the defaults."""
 
     def config(self) -> Config:
         """The preset, on one thread.
 
         Raises:
-            ConfigError: there is no such preset.
+            InputError: the file of settings cannot be read.
+            ConfigError: there is no such preset, or a setting is out of range.
         """
+        path = None if self.settings is None else Path(self.settings)
         asked = {"threads": THREADS, "mapping": {"enabled": not self.tracking_only}}
-        return load_configured(None, self.preset, asked, "benchmark of growth")
+        return load_configured(path, self.preset, asked, "benchmark of growth")
 
     def to_text(self) -> str:
         """The job as JSON, for the process."""

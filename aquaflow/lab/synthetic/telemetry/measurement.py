@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
 import numpy as np
@@ -43,22 +43,32 @@ def measure(
 
     Times are nanoseconds since the first picture.
     """
-    samples: list[TelemetrySample] = []
-    noise, last = config.telemetry, (config.frames - 1) / config.fps
-    for kind, (rate_hz, values_at) in _instruments(config, motion, sonar, constants).items():
-        if rate_hz == 0.0:
-            continue
-        t = np.arange(int(last * rate_hz + 1e-9) + 1) / rate_hz
-        rng = instrument_stream(config.seed, kind)
-        late = rng.exponential(1.0, len(t)) * noise.latency_s
-        # One device's messages arrive in the order in which they were sent.
-        arrival = np.maximum.accumulate(t + late)
-        values = values_at(t, rng)
-        heard = np.isfinite(values).all(axis=1) & (t >= noise.starts_late_s)
-        for k in np.flatnonzero(heard):
-            t_ns, arrival_ns = round(float(t[k]) * 1e9), round(float(arrival[k]) * 1e9)
-            samples.append(sample_of(kind, t_ns, arrival_ns, SOURCE, values[k].tolist()))
+    last = (config.frames - 1) / config.fps
+    samples = [
+        sample
+        for kind, instrument in _instruments(config, motion, sonar, constants).items()
+        for sample in samples_of(kind, *instrument, last, config)
+    ]
     return sorted(samples, key=lambda sample: sample.arrival_ns)
+
+
+def samples_of(
+    kind: Instrument, rate_hz: float, values_at: Measure, last_s: float, config: SyntheticConfig
+) -> Iterator[TelemetrySample]:
+    """Samples of one instrument until ``last_s``, by arrival; none at a rate of 0."""
+    if rate_hz == 0.0:
+        return
+    noise = config.telemetry
+    t = np.arange(int(last_s * rate_hz + 1e-9) + 1) / rate_hz
+    rng = instrument_stream(config.seed, kind)
+    late = rng.exponential(1.0, len(t)) * noise.latency_s
+    # One device's messages arrive in the order in which they were sent.
+    arrival = np.maximum.accumulate(t + late)
+    values = values_at(t, rng)
+    heard = np.isfinite(values).all(axis=1) & (t >= noise.starts_late_s)
+    for k in np.flatnonzero(heard):
+        t_ns, arrival_ns = round(float(t[k]) * 1e9), round(float(arrival[k]) * 1e9)
+        yield sample_of(kind, t_ns, arrival_ns, SOURCE, values[k].tolist())
 
 
 def _instruments(
