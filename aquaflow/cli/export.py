@@ -363,7 +363,17 @@ def _restore(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[str
     from aquaflow.dive.restored import export_restored
 
     count = export_restored(job.dive, path, job.recording, job.progress(format))
-    return f"Wrote {count} restored frames to {path}{_source(job)}.", {"frames": count}
+    said = f"Wrote {count} restored frames to {path}{_source(job)}.\n{_geotagged(job)}"
+    return said, {"frames": count, "geotagged": job.dive.frame.georeferenced}
+
+
+def _geotagged(job: _Job) -> str:
+    from aquaflow.survey.export.geotags import missing_place
+
+    frame = job.dive.frame
+    if frame.georeferenced:
+        return "Each says in EXIF where it was taken."
+    return f"None says in EXIF where it was taken: the dive has no place; {missing_place(frame)}."
 
 
 def _source(job: _Job) -> str:
@@ -445,8 +455,11 @@ def _posed_pictures(job: _Job, path: Path, format: ExportFormat) -> tuple[str, d
     )
     where = placement(job.dive.frame)
     said = f"Wrote {count} pictures with their poses to {path}{_source(job)}: {where.axes}; "
-    said += f"{where.unit}."
-    facts = {"frames": count, "unit": where.unit, "axes": where.axes}
+    said += f"{where.unit}.\n{_geotagged(job)}"
+    facts = {
+        "frames": count, "unit": where.unit, "axes": where.axes,
+        "geotagged": job.dive.frame.georeferenced,
+    }  # fmt: skip
     if not colmap:
         return said, facts
     drawn = "pictures that are drawn measure nothing" if job.recording is None else None

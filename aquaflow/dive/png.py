@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,8 @@ from aquaflow.base.storage.atomic import atomic_write
 
 MOST_PIXELS = 1 << 24
 """Of a picture in a dive folder: 16 million, more than any is mapped in."""
+HEADER = 8 + 25
+"""Bytes of a PNG's signature and of its first chunk."""
 
 
 def encoded_png(
@@ -55,12 +59,21 @@ def read_png(
 def write_png(
     path: Path,
     picture: npt.NDArray[np.uint8],  # [H, W] grey, [H, W, 3] RGB or [H, W, 4] RGBA
+    exif: bytes | None = None,
 ) -> None:
-    """Write ``picture``.
+    """Write ``picture``, with ``exif`` if there is some.
 
     Raises:
         InputError: the file cannot be written.
     """
     content = encoded_png(picture)
+    if exif is not None:
+        content = content[:HEADER] + _chunk(b"eXIf", exif) + content[HEADER:]
     with atomic_write(path) as stream:
         stream.write(content)
+
+
+def _chunk(name: bytes, content: bytes) -> bytes:
+    """Of a PNG file (ISO/IEC 15948)."""
+    named = name + content
+    return struct.pack(">I", len(content)) + named + struct.pack(">I", zlib.crc32(named))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.picture_exif import exif_of_views
 from aquaflow.dive.png import write_png
 from aquaflow.dive.point_cloud import PointCloud, PosedView, read_posed_views, read_splats
 from aquaflow.geometry.camera import CameraModel
@@ -41,6 +42,7 @@ def export_restored(
     With the ``recording``, its pictures with the water taken out (J-hat of the paper), and as
     INDEX_confidence.png what share of each pixel was restored from the picture; without, the map
     from where they were taken: no noise and no fish, but no finer detail than the map's either.
+    Pictures of a dive on the earth say in EXIF where and when they were taken.
 
     Raises:
         InputError: the dive has no map or no water, or the recording is another.
@@ -48,9 +50,10 @@ def export_restored(
     """
     mapper = dive.map()
     tone, count = tone_without_water(dive, mapper), 0
+    exif = exif_of_views(dive, mapper.views)
     with whole_folder(out) as made:
         for index, picture in restored_frames(dive, mapper, recording):
-            write_png(made / f"{index:06d}.png", picture.picture_bytes(tone))
+            write_png(made / f"{index:06d}.png", picture.picture_bytes(tone), exif.get(index))
             if recording is not None:
                 write_png(made / f"{index:06d}_confidence.png", picture.confidence_bytes())
             count += 1
@@ -254,7 +257,7 @@ def export_posed_pictures(
     ``write_model`` add cameras, poses and points; returns how many pictures there are.
 
     With ``restored`` pictures and points are without water; without a ``recording`` such pictures
-    are drawn from the map.
+    are drawn from the map. Of a dive on the earth they say in EXIF where and when they were taken.
 
     Raises:
         InputError: the dive has no map, the recording is missing or another, or a file cannot be
@@ -263,6 +266,7 @@ def export_posed_pictures(
     """
     mapper = dive.map()
     views, where = read_posed_views(dive, mapper)
+    exif = exif_of_views(dive, mapper.views)
     cloud = PointCloud(read_splats(dive, where, water=not restored), views, where)
     pictures = (
         _without_water(dive, mapper, recording)
@@ -272,7 +276,7 @@ def export_posed_pictures(
     with whole_folder(out) as made:
         (made / IMAGES).mkdir()
         for done, (index, picture) in enumerate(pictures, start=1):
-            write_png(made / IMAGES / picture_name(index), picture)
+            write_png(made / IMAGES / picture_name(index), picture, exif.get(index))
             if progress is not None:
                 progress(done, len(views))
         write_model(made, views, cloud)

@@ -213,6 +213,7 @@ def test_the_command_writes_a_folder_in_the_dive(dive: MappedDive, name: str) ->
     }
     assert said == {
         "out": str(dive.path / name), "frames": 3, "unit": "m", "axes": "x east, y north, z up",
+        "geotagged": True,
     }  # fmt: skip
     assert tracks == (
         {"tracks": 0, "track_length": None, "error_px": None} if name == "colmap" else {}

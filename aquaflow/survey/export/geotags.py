@@ -70,7 +70,7 @@ def read_geotags(dive: Dive) -> Geotags:
     frame = dive.frame
     grid = grid_of(frame)
     if grid is None:
-        raise InputError(f"{dive} has no place on a map's grid: {_missing(frame)}")
+        raise InputError(f"{dive} has no place on a map's grid: {missing_place(frame)}")
     poses, sub_maps = dive.trajectory, dive.sub_map_of_pose
     named = [
         (row.source if "#" not in row.source else picture_name(row.index))
@@ -98,7 +98,7 @@ def read_geotags(dive: Dive) -> Geotags:
     )  # fmt: skip
 
 
-def _missing(frame: WorldFrame) -> str:
+def missing_place(frame: WorldFrame) -> str:
     """Why there is no grid, and what would give one."""
     if frame.georeferenced:
         return "UTM ends near the poles"
