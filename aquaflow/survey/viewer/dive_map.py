@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +13,10 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.coverage_file import NAME, read_coverage_file
+from aquaflow.survey.viewer.floaters import find_floaters
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level
 from aquaflow.survey.viewer.splats import ViewerSplats, splats
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -32,7 +35,7 @@ class DiveMap:
 def read_map(
     dive: Dive,
     ply: Path,
-    cameras: npt.NDArray[np.float64],  # [M, 3] of the path
+    poses: Sequence[Sim3],  # of the path
     frame: WorldFrame,
     budget: int,
 ) -> DiveMap:
@@ -42,6 +45,7 @@ def read_map(
         InputError: the file cannot be read.
     """
     gaussians = read_ply(ply)
+    cameras = np.array([pose.t for pose in poses]).reshape(-1, 3)
     levels, palettes = _levels(gaussians.means, cameras, frame.unit)
     classes = coverage_of_dive(dive, gaussians.means, frame)
     if classes is not None:
@@ -50,6 +54,7 @@ def read_map(
         np.asarray(gaussians.means, np.float32), np.asarray(gaussians.wxyz, np.float32),
         np.asarray(gaussians.scales, np.float32), np.asarray(gaussians.opacities, np.float32),
         np.asarray(gaussians.colours, np.float32), budget, levels,
+        find_floaters(gaussians, poses, dive.camera),
     )  # fmt: skip
     return DiveMap(shown, palettes, len(gaussians.means))
 

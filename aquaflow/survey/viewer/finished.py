@@ -100,7 +100,7 @@ def finished_dive(dive: Dive, budget: int) -> FinishedDive:
         water, ply = None, dive.file("map.ply")
     key = key_of(folder, budget)
     return FinishedDive(
-        folder, ply, cache(partial(read_map, dive, ply, path.places, frame, budget)),
+        folder, ply, cache(partial(read_map, dive, ply, path.poses, frame, budget)),
         read_packed(folder, key), key, water, path, camera, frame,
     )  # fmt: skip
 

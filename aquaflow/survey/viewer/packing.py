@@ -91,10 +91,12 @@ class Packed:
         """What a browser needs to read the chunks."""
         weight = self._splats.weights().astype(np.float64)
         covered = np.cumsum(weight)[[end - 1 for end in self._ends]] if self._ends else np.zeros(0)
-        total = max(float(weight.sum()), 1e-300)
+        surface = len(weight) - self._splats.floaters
+        total = max(float(weight[:surface].sum()), 1e-300)
         return {
             "version": self.version,
             "count": len(self._splats),
+            "floaters": self._splats.floaters,
             "ends": self._ends,
             "covered": (covered / total).tolist(),
             "middle": self._code.middle.tolist(),
@@ -211,8 +213,18 @@ log = logging.getLogger(__name__)
 
 NAME = "view.zip"
 """In a dive's folder (docs/formats.md#view)."""
+FORMAT = 2
+"""Raised whenever a browser is sent something else of the same files."""
 SOURCES = (
-    *("map.ply", "map_clear.ply", "medium.json", "metric.json", "trajectory.tum", "coverage.npz"),
+    *(
+        "map.ply",
+        "map_clear.ply",
+        "medium.json",
+        "metric.json",
+        "trajectory.tum",
+        "coverage.npz",
+        "camera.yaml",
+    ),
 )
 """Files of a dive that the packed map depends on."""
 ABOUT = "about.json"
@@ -283,7 +295,7 @@ class PackedFile:
 
 def key_of(dive: Path, budget: int) -> dict[str, Any]:
     """By what a packed map is known to be of these files as they are now."""
-    found: dict[str, Any] = {"aquaflow": __version__, "budget": budget}
+    found: dict[str, Any] = {"aquaflow": __version__, "format": FORMAT, "budget": budget}
     for name in SOURCES:
         try:
             stat = (dive / name).lstat()

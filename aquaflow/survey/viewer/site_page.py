@@ -18,6 +18,7 @@ from aquaflow.survey.site.site_map_file import join, read_site_map
 from aquaflow.survey.viewer.dive_map import CLASSES, COVERAGE, DiveMap, coverage_of_dive
 from aquaflow.survey.viewer.dive_path import LONGEST_PATH
 from aquaflow.survey.viewer.finished import frame_in_words, prepare
+from aquaflow.survey.viewer.floaters import find_floaters
 from aquaflow.survey.viewer.levels import RANGE, RGB, Palette, range_level
 from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import HEADING, PICTURE
@@ -95,9 +96,14 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
     cameras = np.concatenate([placed.path.places for placed in shown.dives])
     if len(cameras) and len(all_of.means):
         levels[RANGE], palettes[RANGE] = range_level(all_of.means, cameras, shown.frame.unit)
+    floaters = np.concatenate([
+        find_floaters(own, placed.path.poses, placed.dive.camera)
+        for placed, own in zip(shown.dives, maps, strict=True)
+    ])  # fmt: skip
     found = splats(
-        all_of.means, all_of.wxyz, all_of.scales, all_of.opacities, all_of.colours, budget, levels
-    )
+        all_of.means, all_of.wxyz, all_of.scales, all_of.opacities, all_of.colours, budget, levels,
+        floaters,
+    )  # fmt: skip
     return DiveMap(found, palettes, len(all_of.means))
 
 

@@ -13,7 +13,8 @@ Levels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class ViewerSplats:
-    """N Gaussians in the world; those whose opacity and area are largest come first."""
+    """N Gaussians in the world; those whose opacity and area are largest come first, and those that
+    float last."""
 
     centres: Float
     """[N, 3]"""
@@ -27,15 +28,17 @@ class ViewerSplats:
     """[N, 3] without the water, at least 0."""
     levels: dict[str, Levels] = field(default_factory=dict)
     """[N] further values of each, by name: 0 to 255, as a palette has colours for them."""
+    floaters: int = 0
+    """How many float, see :mod:`aquaflow.survey.viewer.floaters`: the last ones."""
 
     def __len__(self) -> int:
         return len(self.centres)
 
     def among(
         self,
-        chosen: npt.NDArray[np.bool_],  # [N]
+        chosen: npt.NDArray[np.bool_] | slice,  # [N]
     ) -> ViewerSplats:
-        """Only those."""
+        """Only those, none of which counts as floating."""
         return ViewerSplats(
             self.centres[chosen], self.wxyz[chosen], self.scales[chosen], self.opacities[chosen],
             self.colours[chosen], {name: values[chosen] for name, values in self.levels.items()},
@@ -54,20 +57,23 @@ def splats(
     colours: Float,  # [N, 3]
     budget: int,
     levels: dict[str, Levels] | None = None,  # [N] each
+    floaters: npt.NDArray[np.bool_] | None = None,  # [N]
 ) -> ViewerSplats:
     """At most ``budget`` of them: those that cover most, by opacity and area. The others' share of
-    the surface goes to them, so that no holes open.
+    the surface goes to them, so that no holes open; ``floaters`` are none.
 
     What is not finite is left out.
     """
     sound = np.isfinite(means).all(1) & np.isfinite(scales).all(1) & np.isfinite(quats).all(1)
     sound &= np.isfinite(opacities) & np.isfinite(colours).all(1)
     weight = weights(np.where(sound, opacities, 0.0), np.where(sound[:, None], scales, 0.0))
-    order = np.argsort(-weight, kind="stable")
+    floats = np.zeros(len(means), bool) if floaters is None else floaters
+    order = np.lexsort((-weight, floats))
     chosen = order[sound[order]][:budget]
-    share = float(weight[chosen].sum() / max(float(weight.sum()), 1e-12))
+    surface = ~floats[chosen]
+    share = float(weight[chosen[surface]].sum() / max(float(weight[~floats].sum()), 1e-12))
     # Areas grow by the root of what was left out: twice the gaps, no mud.
-    grown = 1.0 if len(chosen) == sound.sum() else min(max(share, 0.25), 1.0) ** -0.25
+    grown = 1.0 if surface.sum() == (sound & ~floats).sum() else min(max(share, 0.25), 1.0) ** -0.25
     return ViewerSplats(
         means[chosen].astype(np.float32),
         _unit(quats[chosen]),
@@ -75,6 +81,7 @@ def splats(
         np.clip(opacities[chosen], 0.0, 1.0).astype(np.float32),
         np.maximum(colours[chosen], 0.0).astype(np.float32),
         {name: values[chosen] for name, values in (levels or {}).items()},
+        int((~surface).sum()),
     )
 
 

@@ -25,7 +25,8 @@ from aquaflow.survey.viewer.measuring import (
     vector,
 )
 from aquaflow.survey.viewer.picking import pick
-from aquaflow.survey.viewer.viewer_content import ShownMap, ViewerContent
+from aquaflow.survey.viewer.splats import ViewerSplats
+from aquaflow.survey.viewer.viewer_content import ViewerContent
 from aquaflow.telemetry.world_frame import WorldFrame
 
 NOTES, SCALE, LEVEL = ("notes/list", "notes/add", "notes/remove"), "scale", "level"
@@ -66,7 +67,7 @@ class Tools:
             self._turn.release()
 
     def _pick(self, given: Asked) -> Asked:
-        found = pick(self._map().splats(), *ray_of(given))
+        found = pick(self._shown(given), *ray_of(given))
         return {"place": found.place.tolist(), "range": found.range, "sigma": found.sigma}
 
     def _measure(self, given: Asked) -> Asked:
@@ -75,19 +76,22 @@ class Tools:
             raise InputError(f"a measurement needs 1 to {MOST_POINTS} points; mark them again")
         if not all(isinstance(each, dict) for each in asked):
             raise InputError("a point to measure is none; mark it again")
-        shown, exhibit = self._map(), self.exhibit
+        shown, exhibit = self._shown(given), self.exhibit
         assert exhibit is not None
         camera = exhibit.camera
         width = 1.0 if camera is None else camera.camera.width / camera.camera.fx
         cameras = exhibit.path[:, :3].astype(np.float64)
-        scene = MeasuringScene(shown.splats(), cameras, width, np.array(exhibit.up), self.frame)
+        scene = MeasuringScene(shown, cameras, width, np.array(exhibit.up), self.frame)
         return measure(str(given.get("what")), asked, scene)
 
-    def _map(self) -> ShownMap:
+    def _shown(self, given: Asked) -> ViewerSplats:
+        """The Gaussians that a browser shows, by what it says of them: with ``all`` those that float
+        too."""
         shown = None if self.exhibit is None else self.exhibit.map
         if shown is None:
             raise InputError("there is no map yet to point at; wait for it")
-        return shown
+        splats = shown.splats()
+        return splats if given.get("all") else splats.among(slice(len(splats) - splats.floaters))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import base64
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -197,6 +198,24 @@ def test_what_is_far_from_the_path_is_hidden(shown: Browser, tmp_path: Path) -> 
     until(shown, 0.5, 0.5, tmp_path, "r > 90")
     put(shown, "#within", 40)
     until(shown, 0.5, 0.5, tmp_path, "r < 40")
+
+
+def test_what_floats_is_hidden_until_all_is_asked_for(
+    shown: Browser, page: ViewerPage, tmp_path: Path
+) -> None:
+    before = page._exhibit.map
+    plane = replace(floor(step=0.1), floaters=1)
+    plane.centres[-1], plane.scales[-1], plane.colours[-1] = (0, 0, 2), 0.3, (0.9, 0.1, 0.1)
+    try:
+        page.show_splats(plane)
+        show(shown, page, SCREEN)
+        assert shown.text("#floaters").strip() == "Show all: one that floats is hidden"
+        until(shown, 0.5, 0.5, tmp_path, "abs(r - b) < 12 and r > 90")
+        shown.click("#all")
+        until(shown, 0.5, 0.5, tmp_path, "r > b + 60")
+        shown.wait("/all=1/.test(location.hash)")
+    finally:
+        page._exhibit.map = before
 
 
 def test_two_points_are_a_distance_and_three_an_area(shown: Browser) -> None:

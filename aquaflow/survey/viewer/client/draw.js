@@ -17,7 +17,7 @@ export class Drawing {
   // `drawn(drawing)` is called after each picture.
   constructor(canvas, drawn) {
     Object.assign(this, { canvas, drawn, about: null, next: null, count: 0, began: null, moving: false });
-    this.look = { water: 0, through: 1, wipe: null, level: -1, rangeLevel: -1, within: 255 };
+    this.look = { water: 0, through: 1, wipe: null, level: -1, rangeLevel: -1, within: 255, all: false };
     this.cost_us = 5; // of a Gaussian; measured from the first picture on
   }
 
@@ -76,9 +76,10 @@ export class Drawing {
 
   // How many are drawn now: as many as the device draws in time; what that is, the first chunk tells.
   get limit() {
-    if (this.shownAt === undefined) return Math.min(this.count, this.about.ends[0]);
+    const { about, look } = this, wanted = Math.min(this.count, about.count - (look.all ? 0 : about.floaters));
+    if (this.shownAt === undefined) return Math.min(wanted, about.ends[0]);
     const most = (this.moving ? MOVING_MS : STILL_MS) * 1000 / this.cost_us / (this.look.wipe === null ? 1 : 2);
-    return Math.min(this.count, Math.max(FEWEST, Math.round(most)));
+    return Math.min(wanted, Math.max(FEWEST, Math.round(most)));
   }
 
   // Whether what is on the screen is the last word.
@@ -135,7 +136,7 @@ export class Drawing {
     const k = ends.findIndex(end => end >= limit), before = k > 0 ? ends[k - 1] : 0;
     const [low, high] = [k > 0 ? covered[k - 1] : 0, covered[k]];
     const share = low + (high - low) * (limit - before) / Math.max(1, ends[k] - before);
-    return Math.min(2.5, Math.max(share, 1e-3) ** -0.5);
+    return Math.min(2.5, Math.max(1e-3, Math.min(share, 1)) ** -0.5);
   }
 
   // Whether the last picture is on the screen; learns what a Gaussian costs.

@@ -1,8 +1,9 @@
 // The address of what is looked at: the eye's place, or the pose of the path, and how it is shown.
 
 const WAIT_MS = 300; // after a movement: browsers allow no address for every picture
-const SHOWN = { water: "0", colours: "picture" }; // controls that a link has, where they are not so
+const SHOWN = { water: "0", colours: "picture", all: "" }; // controls that a link has, where they are not so
 const find = id => document.getElementById(id);
+const state = control => control.type === "checkbox" ? control.checked ? "1" : "" : control.value;
 const numbers = text => (text ?? "").split(",").map(Number);
 const isPlace = place => place.length === 3 && place.every(Number.isFinite);
 
@@ -20,7 +21,7 @@ export class Link {
       said.set("at", place(eye.place));
       said.set("to", place(eye.target));
     }
-    for (const [id, usual] of Object.entries(SHOWN)) if (find(id).value !== usual) said.set(id, find(id).value);
+    for (const [id, usual] of Object.entries(SHOWN)) if (state(find(id)) !== usual) said.set(id, state(find(id)));
     return said.toString().replaceAll("%2C", ",");
   }
 
@@ -43,10 +44,11 @@ export class Link {
       eye.look(at, to);
     } else return false;
     for (const [id, usual] of Object.entries(SHOWN)) {
-      const control = find(id), before = control.value;
-      control.value = said.get(id) ?? usual;
+      const control = find(id), before = control.value, wanted = said.get(id) ?? usual;
+      if (control.type === "checkbox") control.checked = Boolean(wanted);
+      else control.value = wanted;
       if (!control.value) control.value = before; // a colouring that this map has not
-      control.dispatchEvent(new Event(control.tagName === "SELECT" ? "change" : "input"));
+      control.dispatchEvent(new Event(control.type === "range" ? "input" : "change"));
     }
     return true;
   }

@@ -22,10 +22,13 @@ export class Looks {
     Object.assign(this, { changed, about: null, unit: "", drawing: null, offered: "" });
     find("wipe").addEventListener("change", () => this.wipe());
     for (const id of ["water", "through", "within"]) find(id).addEventListener("input", () => this.apply());
-    find("colours").addEventListener("change", () => this.apply());
+    for (const id of ["colours", "all"]) find(id).addEventListener("change", () => this.apply());
   }
 
   get wiping() { return find("wipe").checked; }
+
+  // What of the map is shown, for who points at it.
+  get shown() { return { all: find("all").checked }; }
 
   begin(drawing, placeDivider) { Object.assign(this, { drawing, placeDivider }); }
 
@@ -44,6 +47,8 @@ export class Looks {
   offer(about, unit, metres) {
     Object.assign(this, { about, unit, metres });
     find("water-part").hidden = !about.water;
+    find("floaters").hidden = !about.floaters;
+    find("floaters").lastElementChild.textContent = about.floaters === 1 ? "one that floats is hidden" : `${about.floaters} that float are hidden`;
     find("within-part").hidden = !("range" in about.palettes);
     const names = about.levels.filter(name => name in about.palettes), offered = names.join();
     if (offered !== this.offered) {
@@ -58,6 +63,7 @@ export class Looks {
 
   apply() {
     const { about, unit, drawing } = this, look = drawing.look, name = find("colours").value;
+    look.all = find("all").checked;
     look.water = Number(find("water").value) / 100;
     find("water-value").textContent = `${find("water").value} %`;
     if (about.water) {

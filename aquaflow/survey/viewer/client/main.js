@@ -30,9 +30,9 @@ const drawn = () => {
   times.whole = drawing.count === scene.map.count ? times.whole ?? performance.now() : undefined;
 };
 const eye = new Eye([0, -1, 0]), marks = new Marks(find("marks"));
-const tools = new ToolBox(marks, changed);
+const looks = new Looks(changed), tools = new ToolBox(marks, looks, changed);
 const line = new TimeLine(eye, changed);
-const looks = new Looks(changed), link = new Link(eye, line);
+const link = new Link(eye, line);
 window.aquaflowEye = eye; // for who looks at the page from outside, as its tests do
 
 hands(find("marks"), eye, {
@@ -62,7 +62,7 @@ find("home").addEventListener("click", home);
 async function rangeAhead() {
   const { fx } = eye.optics(marks.canvas.clientWidth, marks.canvas.clientHeight);
   try {
-    return (await tell("pick", { origin: eye.place, direction: eye.ahead, pixel_rad: 1 / fx })).range;
+    return (await tell("pick", { origin: eye.place, direction: eye.ahead, pixel_rad: 1 / fx, ...looks.shown })).range;
   } catch { return eye.distance; }
 }
 

@@ -15,8 +15,8 @@ const LEAST = { distance: 2, area: 3, profile: 2 };
 const find = id => document.getElementById(id);
 
 export class ToolBox {
-  constructor(marks, changed) {
-    Object.assign(this, { marks, changed, tool: null, points: [], quantities: {}, turn: 0, can: [] });
+  constructor(marks, looks, changed) {
+    Object.assign(this, { marks, looks, changed, tool: null, points: [], quantities: {}, turn: 0, can: [] });
     for (const button of document.querySelectorAll("[data-tool]")) {
       button.addEventListener("click", () => this.choose(this.tool === button.dataset.tool ? null : button.dataset.tool));
     }
@@ -70,7 +70,7 @@ export class ToolBox {
 
   async add(ray) {
     const turn = this.turn, tool = this.tool;
-    const found = await tell("pick", ray);
+    const found = await tell("pick", { ...ray, ...this.looks.shown });
     if (turn !== this.turn) return;
     if (this.points.length >= (MOST[tool] ?? Infinity)) this.points = [];
     this.points.push({ ...found, ray });
@@ -86,7 +86,7 @@ export class ToolBox {
 
   async measure(turn) {
     const points = this.points.map(({ place, sigma, range, ray }) => ({ place, sigma, range, ...ray }));
-    const said = await tell("measure", { what: this.tool, points });
+    const said = await tell("measure", { what: this.tool, points, ...this.looks.shown });
     if (turn !== this.turn || points.length !== this.points.length) return;
     this.quantities = said.quantities;
     find("note-form").hidden = !this.can.includes("note");
