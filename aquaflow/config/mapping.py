@@ -292,7 +292,12 @@ class MappingConfig(StageConfig):
 
     enabled: bool = Field(True, description="False: trajectory only")
     renderer: Literal["auto", "cpu", "tiles", "gsplat", "wgpu"] = "auto"
-    max_gaussians: int = Field(150_000, ge=1000, description="hard cap")
+    max_gaussians: int = Field(
+        150_000,
+        ge=1000,
+        description="of a sub-map in memory; those of ground that is far from what is seen wait in "
+        "files meanwhile, and where all is near, those of least weight make room",
+    )
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"
     )

@@ -56,7 +56,7 @@ def report(
         "keyframes": len(parts.slam.keyframes),
         "consistency": parts.slam.tracker.monitor.counts.to_json(),
         "in_site": None if parts.slam.in_base is None else in_site_numbers(parts.slam.in_base),
-        "gaussians": sum(len(mapper.gaussians) for mapper in list(parts.maps.mappers.values())),
+        "gaussians": sum(mapper.count for mapper in list(parts.maps.mappers.values())),
         "checkpoint": {
             "taken": parts.checkpointer.taken,
             "failures": parts.checkpointer.failures,

@@ -21,6 +21,7 @@ from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import Facts, deserialise, serialise
+from aquaflow.mapping.tiles import TileFiles
 from aquaflow.render.contract import Renderer
 from aquaflow.render.cpu import cpu_renderer
 from aquaflow.render.gsplat import give_back_after
@@ -122,8 +123,14 @@ MAY_BE_LEFT_OUT = {"copy of the map", "insertion", "optimisation", "voxels in me
 class DeviceWork:
     """The maps by sub-map, and the device they are on."""
 
-    def __init__(self, config: Config, renderer: Renderer, failures: Failures) -> None:
-        self.renderer = renderer
+    def __init__(
+        self,
+        config: Config,
+        renderer: Renderer,
+        failures: Failures,
+        tiles: TileFiles | None = None,
+    ) -> None:
+        self.renderer, self._tiles = renderer, tiles
         self.mappers: dict[int, Mapper] = {}
         self._copies = HostCopies()
         self._config, self._failures = config, failures
@@ -134,7 +141,9 @@ class DeviceWork:
         """The map of a sub-map, made when first asked for."""
         if number not in self.mappers:
             seed = self._config.seed + number
-            self.mappers[number] = Mapper(self._config.mapping, self.renderer, seed, self._failures)
+            self.mappers[number] = Mapper(
+                self._config.mapping, self.renderer, seed, self._failures, self._tiles
+            )
         return self.mappers[number]
 
     def do(

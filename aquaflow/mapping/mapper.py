@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from aquaflow.base.clocks.wall import Deadline
-from aquaflow.base.errors import is_device_failure, is_device_full
+from aquaflow.base.errors import InputError, is_device_failure, is_device_full
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
+from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians import (
@@ -40,6 +41,7 @@ from aquaflow.mapping.optimisation import (
 from aquaflow.mapping.registration import register, take_light
 from aquaflow.mapping.scene import RenderedMap, Scene
 from aquaflow.mapping.scene_water import WaterFitting, rebalance
+from aquaflow.mapping.tiles import KEPT_SHARE, Sphere, TileFiles, Tiles
 from aquaflow.render.contract import Renderer
 from aquaflow.render.gsplat import give_back_after
 from aquaflow.render.views import View, in_time
@@ -66,8 +68,10 @@ class Mapper:
         renderer: Renderer,
         seed: int,
         failures: Failures | None = None,
+        tiles: TileFiles | None = None,
     ) -> None:
-        """What a fit or a step raises is counted in ``failures`` and skipped."""
+        """What a fit or a step raises is counted in ``failures`` and skipped; what has no room in
+        memory waits in ``tiles``."""
         self.config, self.renderer = config, renderer
         self.device = renderer.device
         """Where everything that the map is made of lives."""
@@ -86,6 +90,10 @@ class Mapper:
             self.scene.neural = NeuralGaussians(
                 config.decoder, self.gaussians, config.optimiser.betas, drawn, renderer.threads
             )
+        self.tiles = Tiles(tiles)
+        """What of the map waits in files."""
+        self._here: list[View] | None = None
+        """Views on whose ground nothing waits; None: all."""
         self._objective = Objective(config.loss, renderer.threads)
         self.optimiser = MapOptimiser(config, self.scene, self._objective)
         self.water_fitting = WaterFitting(config.medium, self.scene, self._random, self.failures)
@@ -99,9 +107,18 @@ class Mapper:
             if self.views:
                 view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
             self.views.append(view)
-        if self.water_fitting.go_on(self.views):
+            if self._here is not None:
+                self._here.append(view)
+        # What waits cannot follow a change of the water.
+        if not self.tiles.waiting and self.water_fitting.go_on(self.views):
             with self.failures.contain("sunlight"):
                 self.scene.sunlight.judge(in_time(self.views))
+
+    def forget(self, views: Sequence[View]) -> None:
+        """These are no longer among the map's views."""
+        for view in views:
+            if self._here is not None and view in self._here:
+                self._here.remove(view)
 
     def _take(self, view: View) -> None:
         """Let the view's tensors be where the map is."""
@@ -119,6 +136,7 @@ class Mapper:
         tracked.keep_in(view)
         tracked = tracked.on(self.device)
         tracked_z = tracked.z * view.T_wc.scale
+        ground = self._come_to(view, tracked_z[tracked.known])
 
         # J-tilde, alpha and range of the map as it is, drawn from the view.
         shown = self.scene.show(view, learn=True)
@@ -138,7 +156,7 @@ class Mapper:
         rows, columns = select(P_a, allowed, density, config, self._random)
 
         # Room for them below the hard cap.
-        rows, columns = self._make_room(rows, columns, agreed_alpha < COVERED_ALPHA)
+        rows, columns = self._make_room(rows, columns, agreed_alpha < COVERED_ALPHA, ground)
 
         # Gaussians on the rays of these pixels.
         if len(rows) == 0:
@@ -161,9 +179,12 @@ class Mapper:
         rows: Tensor,  # [M]
         columns: Tensor,  # [M]
         bare: Tensor,  # [H, W] bool
+        ground: Sphere | None,  # what is seen
     ) -> tuple[Tensor, Tensor]:
-        """The pixels that may get a Gaussian. At the hard cap only bare ones do, and a share of the
-        Gaussians, those least worth keeping, makes room for them."""
+        """The pixels that may get a Gaussian. In a full memory far tiles leave; where none may,
+        only bare pixels do, and a share of the Gaussians, those least worth keeping, makes room."""
+        if len(rows) > self.config.max_gaussians - len(self.gaussians):
+            self._let_leave(ground)
         count = len(self.gaussians)
         room = self.config.max_gaussians - count
         if len(rows) > room:
@@ -185,6 +206,88 @@ class Mapper:
         self.optimiser.extend(count, view.centre())
         return count
 
+    # --- what waits in files ------------------------------------------------------------------
+
+    @property
+    def count(self) -> int:
+        """Gaussians of the map, those that wait in files included."""
+        return len(self.gaussians) + len(self.tiles)
+
+    def _come_to(
+        self,
+        view: View,
+        z: Tensor,  # [M] ranges of what the view shows, map units
+    ) -> Sphere | None:
+        """Bring back what waits on the ground that ``view`` shows; where that is, as far as it is
+        known."""
+        can_wait = self.tiles.files.usable and self.device.type == "cpu" and self.neural is None
+        if not can_wait or len(z) == 0:
+            return None
+        ground = self.tiles.look(view, float(z.median()))
+        self._bring(self.tiles.near(ground))
+        if len(self.gaussians) > self.config.max_gaussians:
+            self._let_leave(ground)
+        return ground
+
+    def _let_leave(self, ground: Sphere | None) -> None:
+        """Let tiles far from ``ground`` leave memory, until a share of it is free."""
+        if ground is None:
+            return
+        kept = int(KEPT_SHARE * self.config.max_gaussians)
+        self._release(self.tiles.far(self.gaussians, ground, len(self.gaussians) - kept))
+
+    def _release(self, keyframes: Sequence[int]) -> None:
+        """Let these tiles leave memory."""
+        if not keyframes:
+            return
+        self.optimiser.settle()
+        self.optimiser.keep(self.tiles.leave(self.gaussians, self.optimiser.adam, keyframes))
+        self._find_views_here()
+
+    def _bring(self, keyframes: Sequence[int]) -> None:
+        """Let these tiles be in memory again, where they are as they left."""
+        if not keyframes:
+            return
+        whole, states = GaussianMap(), list[Arrays]()
+        for keyframe in keyframes:
+            with self.failures.contain("tile of the map"):
+                tile, arrays = self.tiles.bring(keyframe)
+                whole.append(tile)
+                states.append(arrays)
+        self.gaussians.append(whole)
+        self.optimiser.take_back(states)
+        self._find_views_here()
+
+    def _fill_around(self, ground: Sphere) -> None:
+        """Let as much of what lies around ``ground`` be in memory as there is room for."""
+        leaving, coming = self.tiles.around(self.gaussians, ground, self.config.max_gaussians)
+        self._release(leaving)
+        self._bring(coming)
+
+    def _find_views_here(self) -> None:
+        if not self.tiles.waiting:
+            self._here = None
+            return
+        known = self.tiles.open_keyframes()
+        self._here = [view for view in self.views if view.keyframe in known]
+
+    def resume_tiles(
+        self,
+        arrays: Arrays,  # as from Tiles.serialise; none of an older checkpoint
+    ) -> None:
+        """Let what waited in files at a checkpoint do so again; what was lost is counted."""
+        if not arrays:
+            return
+        with self.failures.contain("tile of the map"):
+            lost = self.tiles.restore(arrays)
+            self._find_views_here()
+            if lost:
+                raise InputError(f"files of {lost} Gaussians that waited were lost")
+
+    def gather(self) -> None:
+        """Let the whole map be in memory, whatever its size."""
+        self._bring(sorted(self.tiles.waiting))
+
     # --- following the keyframes --------------------------------------------------------------
 
     def move(self, moves: Mapping[int, Sim3]) -> None:
@@ -193,6 +296,7 @@ class Mapper:
         if self.neural is not None:
             self.neural.move(moved)
         move_views(self.views, moves)
+        self.tiles.move(moves)
         self.water_fitting.follow_moves(moves)
 
     def use_unit(self, metres_per_unit: float) -> None:
@@ -210,11 +314,13 @@ class Mapper:
         # Only a decoder needs to know from where each is seen: cameras times Gaussians.
         centres = None if self.neural is None else other.scene.bake(other.views)
         self.gaussians.append(other.gaussians)
+        self.tiles.absorb(other.tiles)
         self.water_fitting.begin_again()
         self.views = views  # from here on make_whole mends what a failure leaves
         self.optimiser.extend(count, centres)
         self.optimiser.steps += other.steps
         self.optimiser.undone += other.undone
+        self._find_views_here()
 
     # --- optimising ---------------------------------------------------------------------------
 
@@ -222,7 +328,8 @@ class Mapper:
         """Steps on the newest view now and then, else on any (paper, Sec. 3.4)."""
         if len(self.gaussians) == 0:
             return
-        chosen = sampled_views(self.views, steps, NEWEST_SHARE, self._random)
+        views = self.views if self._here is None else self._here
+        chosen = sampled_views(views, steps, NEWEST_SHARE, self._random)
         self.scene.centre_water(self.views)
         with self.scene.learning_from(chosen), self.optimiser.stepping():
             for view in chosen:
@@ -236,26 +343,58 @@ class Mapper:
         """The final refinement: all views in random order, rates falling, poses included; as much
         of it as there is time ``until`` then."""
         steps, until = self.config.optimiser.refine_steps, until or Deadline()
-        if not until.over:
+        if not (until.over or self.tiles.waiting):
             self.water_fitting.at_once(self.views)
-        order = shuffled_views(self.views, steps, self._random) if len(self.gaussians) else []
+        if not self.tiles.waiting:
+            self._refine_views(self.views, 0, steps, progress, until)
+        else:
+            self._refine_by_turns(steps, progress, until)
+        with self.failures.contain("white balance"):
+            rebalance(self.scene)
+
+    def _refine_by_turns(
+        self, steps: int, progress: Callable[[int, int], None] | None, until: Deadline
+    ) -> None:
+        """Ground after ground, in the order in which the dive saw it, each as long as its share of
+        the views."""
+        done, refined, whole = 0, set[int](), len(self.views)
+        for keyframe in sorted({view.keyframe for view in self.views} & self.tiles.seen.keys()):
+            if keyframe in refined:
+                continue
+            self._fill_around(self.tiles.seen[keyframe])
+            here = self.views if self._here is None else self._here
+            turn = [view for view in here if view.keyframe not in refined]
+            refined |= {keyframe, *(view.keyframe for view in turn)}
+            share = round(steps * sum(view.keyframe in refined for view in self.views) / whole)
+            self._refine_views(turn, done, share - done, progress, until)
+            done = share
+
+    def _refine_views(
+        self,
+        views: Sequence[View],
+        before: int,
+        steps: int,
+        progress: Callable[[int, int], None] | None,
+        until: Deadline,
+    ) -> None:
+        """``steps`` on ``views``, after as many ``before`` elsewhere."""
+        whole = self.config.optimiser.refine_steps
+        order = shuffled_views(views, steps, self._random) if len(self.gaussians) else []
         with self.scene.learning_from(order), self.optimiser.stepping():
             for step, view in enumerate(order):
                 passed = until.passed
                 if passed >= 1.0:
                     break
-                if step % len(self.views) == 0:  # light shows once the map has lost its errors
-                    self.scene.sunlight.judge(in_time(self.views))
-                    self.scene.centre_water(self.views)
+                if step % len(views) == 0:  # light shows once the map has lost its errors
+                    self.scene.sunlight.judge(in_time(views))
+                    self.scene.centre_water(views)
                 done = share_done(step, steps, passed)
                 self.optimiser.slow_down(refining_rates(done, self.config.optimiser))
                 self._contained_step("refinement", view, self.config.optimiser.poses > 0.0)
                 if self._failed_in_a_row == MOST_FAILED_STEPS:
                     break
                 if progress is not None:
-                    progress(step + 1, steps)
-        with self.failures.contain("white balance"):
-            rebalance(self.scene)
+                    progress(before + step + 1, whole)
 
     def _contained_step(self, stage: str, view: View, refine_poses: bool) -> None:
         """The first view's pose is never refined: it fixes the map's frame."""

@@ -27,6 +27,7 @@ from aquaflow.mapping.device_work import DeviceWork
 from aquaflow.mapping.gaussians import move_views
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
+from aquaflow.mapping.tiles import TileFiles
 from aquaflow.mapping.work import MIN_VIEWS, Growth, Insertion, Progress
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
@@ -53,7 +54,8 @@ class Maps:
         self.config, self.profiler = config, profiler or Profiler()
         self.failures = failures or Failures()
         renderer = renderer or select_renderer(config.mapping.renderer, config.threads)
-        self._work = DeviceWork(config, renderer, self.failures)
+        self.tiles = TileFiles(work)
+        self._work = DeviceWork(config, renderer, self.failures, self.tiles)
         self.held_out: dict[int, list[View]] = {}
         self.views = ViewStore(work)
 
@@ -88,7 +90,8 @@ class Maps:
         self.views.keep(view)
         mapper.add_view(view)  # some views trigger another fit of the water
         group = same_group(view, mapper.views)
-        drop_surplus(mapper.views, group, self.config.mapping.views_per_keyframe)
+        most = self.config.mapping.views_per_keyframe
+        mapper.forget(drop_surplus(mapper.views, group, most))
 
     def optimise(self, sub_map: int, steps: int) -> None:
         """Steps of the optimiser on a sub-map's map."""
@@ -148,6 +151,7 @@ class Maps:
                     share = limit.share(views[number] / sum(views.values()))
                     self._work.do("refinement", number, None, Mapper.refine, progress, share)
                     del views[number]
+                self._work.do("gathering of the map", number, None, Mapper.gather)
                 self._work.mend(number)
                 self._work.copy(number)
 
@@ -169,13 +173,14 @@ class Maps:
         return self.views.holds(view)
 
     def save_pictures(self) -> list[Path]:
-        return self.views.save()
+        return [*self.views.save(), *self.tiles.save()]
 
     @property
     def lost_pictures(self) -> set[int]:
         return self.views.lost
 
     def serialise(self) -> tuple[dict[str, Any], Arrays]:
+        self.tiles.checkpoint()
         return serialise(self.mappers, self.held_out)
 
     def restore(
@@ -183,7 +188,7 @@ class Maps:
         facts: dict[str, Any],
         arrays: Arrays,  # as from serialise
     ) -> None:
-        mappers, held_out = restore(facts, arrays, self.renderer, self.failures)
+        mappers, held_out = restore(facts, arrays, self.renderer, self.failures, self.tiles)
         for number, mapper in mappers.items():
             mapper.views = self.views.restore(mapper.views)
             self.mappers[number] = mapper
@@ -192,6 +197,7 @@ class Maps:
 
     def close(self, keep: bool = False) -> None:
         self.views.close(keep)
+        self.tiles.close(keep)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -207,19 +213,21 @@ def drop_surplus(
     views: list[View],
     group: Sequence[View],  # those of ``views`` that have a budget together
     most: int,
-) -> None:
-    """Drop views, and their pixels, until the ``group`` has at most ``most``.
+) -> list[View]:
+    """Drop views, and their pixels, until the ``group`` has at most ``most``; those dropped.
 
     Always the one whose neighbours are nearest to each other in time, the earliest of equals, so
     that those that stay are spread over the whole time. First and last stay.
     """
-    kept = in_time(group)
+    kept, surplus = in_time(group), list[View]()
     while len(kept) > max(most, 2):
         index = [view.frame_index for view in kept]
         gaps = [after - before for before, after in zip(index, index[2:])]  # noqa: B905
         dropped = kept.pop(1 + gaps.index(min(gaps)))
         views.remove(dropped)
         dropped.delete_pixels()
+        surplus.append(dropped)
+    return surplus
 
 
 # --------------------------------------------------------------------------------------------------
@@ -246,6 +254,7 @@ def restore(
     arrays: Arrays,  # as from serialised
     renderer: Renderer,
     failures: Failures,
+    tiles: TileFiles | None = None,
 ) -> tuple[dict[int, Mapper], dict[int, list[View]]]:
     """Maps and held-out views by sub-map, as they were serialised, without their pictures.
 
@@ -253,7 +262,9 @@ def restore(
         KeyError, ValueError, TypeError, RuntimeError: this is no such checkpoint.
     """
     mappers = {
-        int(number): state.deserialise(values, under(f"map{number}", arrays), renderer, failures)
+        int(number): state.deserialise(
+            values, under(f"map{number}", arrays), renderer, failures, tiles
+        )
         for number, values in facts["maps"].items()
     }
     held_out = {

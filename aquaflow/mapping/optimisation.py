@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from aquaflow.config import LossConfig, MappingConfig, OptimiserConfig
+from aquaflow.geometry.arrays import Arrays
 from aquaflow.mapping.gpu_steps import GpuSteps
 from aquaflow.mapping.neural.decoder import DECODED
 from aquaflow.mapping.scene import RenderedMap, Scene
@@ -215,6 +217,23 @@ class MapOptimiser:
         self.adam.extend(count)
         if self.scene.neural is not None and centres is not None:
             self.scene.neural.insert(centres, count)
+        self.adam.bind(self.scene.gaussians.parameters)
+
+    def take_back(
+        self,
+        states: Sequence[Arrays],  # as from Tiles.bring, in the order of the map's last Gaussians
+    ) -> None:
+        """Give the map's last Gaussians the rows with which they left."""
+        self.settle()
+        joined = {
+            name: torch.from_numpy(np.concatenate([arrays[name] for arrays in states]))
+            for name in states[0]
+        }
+        names = self.scene.gaussians.NAMES
+        first, second = (
+            {n: joined[f"{which}.{n}"] for n in names} for which in ("first", "second")
+        )
+        self.adam.extend_with(joined["steps"], first, second)
         self.adam.bind(self.scene.gaussians.parameters)
 
     def keep(

@@ -34,6 +34,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.mapping.restoration import RESTORED, seen_and_restored
+from aquaflow.mapping.tiles import TileFiles
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.dense_adam import STEP, DenseAdam
@@ -83,6 +84,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
     if mapper.neural is not None:
         arrays |= _decoder(mapper.neural)
     if optimiser:
+        arrays |= add_prefix("tiles", mapper.tiles.serialise())
         facts["next_water_fit"] = mapper.water_fitting.next_fit
         facts["rates"] = {name: adam.learning_rates for name, adam in _adams(mapper).items()}
         facts["rates"] |= {name: each.rates[0] for name, each in _dense(mapper).items()}
@@ -99,17 +101,21 @@ def _white_facts(balance: WhiteBalance | None) -> Facts:
 
 
 def deserialise(
-    facts: Facts, arrays: Mapping[str, Any], renderer: Renderer, failures: Failures | None = None
+    facts: Facts,
+    arrays: Mapping[str, Any],
+    renderer: Renderer,
+    failures: Failures | None = None,
+    tiles: TileFiles | None = None,
 ) -> Mapper:
     """The serialised map; its views have poses, exposures and light, but no pixels.
 
-    What its fits and steps raise is counted in ``failures``.
+    What its fits and steps raise is counted in ``failures``; what waited does so in ``tiles``.
 
     Raises:
         KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.
     """
     config = without_old_keys({"mapping": facts["config"]}, "the map")["mapping"]
-    mapper = Mapper(MappingConfig.model_validate(config), renderer, 0, failures)
+    mapper = Mapper(MappingConfig.model_validate(config), renderer, 0, failures, tiles)
     scene, gaussians, device = mapper.scene, mapper.gaussians, mapper.device
     for name, width in gaussians.WIDTHS.items():
         values = checkpoint_in(arrays[f"gaussians.{name}"], device)
@@ -152,6 +158,7 @@ def deserialise(
     if facts["optimiser"]:
         mapper.water_fitting.next_fit = int(facts["next_water_fit"])
         _read_optimisers(mapper, arrays, facts["rates"])
+        mapper.resume_tiles(under("tiles", arrays))
     return mapper
 
 

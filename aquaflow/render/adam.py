@@ -102,6 +102,20 @@ class SelectiveAdam:
         """Add state for ``n_new`` rows at the end, at step 0; then ``bind`` the grown tensors."""
         self._replace(lambda state: torch.cat([state, state.new_zeros(n_new, *state.shape[1:])]))
 
+    def extend_with(
+        self,
+        steps: Tensor,  # [M]
+        first: Mapping[str, Tensor],  # each [M, ...]
+        second: Mapping[str, Tensor],  # each [M, ...]
+    ) -> None:
+        """Add rows at the end in the state in which they were kept elsewhere; then ``bind``."""
+        moments = [
+            {name: torch.cat([moment, new[name]]) for name, moment in old.items()}
+            for old, new in ((self.first_moments, first), (self.second_moments, second))
+        ]
+        self.steps = torch.cat([self.steps, steps])
+        self.first_moments, self.second_moments = moments
+
     def keep(
         self,
         mask: Tensor,  # [N] bool

@@ -169,6 +169,10 @@ class SurveyPictures:
         turn = so3_exp(sway[3:] * SWAY_RAD)
         return Sim3(turn, np.array([x, y, 0.0]) + sway[:3] * SWAY_M)
 
+    def depth(self, index: int) -> Map:
+        """[H, W] m along the optical axis, the truth of a frame."""
+        return self._intersect_seabed(self.T_wc(index))[2]
+
     def _picture(self, index: int) -> npt.NDArray[np.uint8]:
         x, y, ahead, box = self._intersect_seabed(self.T_wc(index))
         brightness = _sum(self._texture, x, y, box)
