@@ -230,12 +230,14 @@ class Slam:
     def _settle_graph(self, until: Deadline) -> None:
         """The last optimisations, of loops and telemetry, and then the frames in metres."""
         self._wait_for_graph()
+        self.metric.ask_anew()
         if not until.over:
             self.graph.adjust_everything()
             self._wait_for_graph()
         if self.metric.present:
             for _ in range(SETTLING_ROUNDS):
                 if self.metric.strained and not until.over:
+                    self.metric.ask_anew()
                     self.graph.straighten()
                     self._wait_for_graph()
             with self.profiler.stage("metric"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -23,14 +24,23 @@ from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.measured import World
 from aquaflow.tracking.metric.straightening import (
     LengthSightings,
+    Straightened,
     TrackingSnapshot,
     estimates_of,
     sampled_points,
     straighten,
+    straighten_again,
 )
 from aquaflow.types import TelemetrySample
 
 Array = npt.NDArray[np.float64]
+
+FEW_KEYFRAMES = 60
+"""Up to which telemetry is asked whenever loops are closed."""
+ASKED_AGAIN = 0.1
+"""Share of the keyframes that have to be new since telemetry was last asked, beyond
+``FEW_KEYFRAMES``: it answers for the whole dive, in 2 s of CPU time at 112 keyframes and more later
+(notes/2026-11-speed.md#growth). Loops in between are closed with what it said."""
 
 
 class EarlierDive(Protocol):
@@ -73,8 +83,10 @@ class WorldFrames:
         self._failures = failures
         self._points: list[Array] = []
         self._since = 0
-        self._solved: dict[int, WorldFrame] = {}
-        """By component; set in the thread of the last job."""
+        self._solved: Straightened | None = None
+        """Set in the thread of the last job."""
+        self._asked = 0
+        """Keyframes there were when telemetry was last asked; 0: it is to be asked anew."""
         self.strained = True
         """False if the last job left the keyframes where they would be without telemetry: another
         one would, too."""
@@ -119,10 +131,15 @@ class WorldFrames:
         if parent is not None:
             self._keep_points(parent)
         self._since += 1
-        if self._since < self._config.every_keyframes:
+        enough = ASKED_AGAIN * number if number > FEW_KEYFRAMES else 0.0
+        if self._since < max(self._config.every_keyframes, enough):
             return False
-        self._since = 0
+        self._since, self._asked = 0, 0
         return True
+
+    def ask_anew(self) -> None:
+        """Let the next job ask telemetry, however lately that was done."""
+        self._asked = 0
 
     def _keep_points(self, number: int) -> None:
         """A keyframe's depths are as good as they get once another one takes its place."""
@@ -146,14 +163,22 @@ class WorldFrames:
 
     def job(self, snapshot: Snapshot) -> Callable[[Snapshot], GraphResult]:
         """The optimisation of a snapshot together with telemetry, to be called in any thread."""
-        survey = self.survey(snapshot)
-        t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
+        count, before = len(snapshot.nodes), self._solved
         bases = [] if self.base is None else self.base.worlds(snapshot)
+        lately = FEW_KEYFRAMES < count <= (1.0 + ASKED_AGAIN) * self._asked
+        if lately and before is not None and before.fits(snapshot):
+            make = partial(straighten_again, before=before, bases=bases)
+        else:
+            survey, self._asked = self.survey(snapshot), count
+            t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
+
+            def make(better: Snapshot) -> Straightened:
+                return straighten(better, replace(survey, nodes=better.nodes), t_s, bases)
 
         def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
-                solved = straighten(better, replace(survey, nodes=better.nodes), t_s, bases)
-                self._solved, self.strained = solved.frames, solved.strained
+                self._solved = solved = make(better)
+                self.strained = solved.strained
                 return solved.result
             return solve(better)  # what telemetry cannot do must not cost the loops
 
@@ -163,7 +188,8 @@ class WorldFrames:
         """The last job's result has been taken over by the keyframes."""
         if self.base is not None:
             self.base.follow_moves()
-        self._take(self._solved)
+        if self._solved is not None:
+            self._take(self._solved.frames)
 
     def update(self, snapshot: Snapshot) -> dict[int, WorldFrame]:
         """Estimate the frames of all sub-maps from their poses as they are now."""
