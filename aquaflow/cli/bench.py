@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
@@ -123,15 +123,24 @@ def growth(
     width: Annotated[int, typer.Option(min=64, max=1920, help="Of the pictures, pixels.")] = 160,
     preset: Annotated[str, typer.Option(help=PRESETS)] = "balanced",
     tracking_only: Annotated[bool, typer.Option(help="Trajectories without maps.")] = False,
+    scene: Annotated[
+        str, typer.Option(help="lines | hour: with transits, revisits and all that befalls a dive.")
+    ] = "lines",
+    telemetry: Annotated[str, typer.Option(help="none | attitude | dvl: what is aboard.")] = "none",
+    config: Annotated[Path | None, typer.Option(help="Settings below the preset's.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Only 150 and 300 frames.")] = False,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_growth"),
     as_json: Json = False,
 ) -> None:
     """What a frame costs in long dives: synthetic surveys, CPU time, memory, files, viewer."""
     from aquaflow.lab.bench.growth import benchmark as bm
+    from aquaflow.lab.bench.growth.job import Instruments
+    from aquaflow.lab.synthetic.survey_plan import SurveyScene
 
     counts = frames or (bm.QUICK_FRAMES if quick else bm.FRAMES)
-    jobs = bm.jobs_of(counts, width, preset, tracking_only, out)
+    shown = one_of(get_args(SurveyScene), scene, "--scene")
+    aboard = one_of(get_args(Instruments), telemetry, "--telemetry")
+    jobs = bm.jobs_of(counts, width, preset, tracking_only, out, shown, aboard, config)
     with progress_bars(as_json) as progress:
         result = bm.bench_growth(jobs, out, progress)
     if as_json:

@@ -31,23 +31,38 @@ class BodyPath(Protocol):
         """[3] m"""
         ...
 
-    def centre_w(self, t: Array) -> Array:
+    def centre_w(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """[N, 3] m, the camera's centre in the world."""
         ...
 
-    def velocity_w(self, t: Array) -> Array:
+    def velocity_w(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """[N, 3] m/s of the camera over ground, in the world."""
         ...
 
-    def R_wb(self, t: Array) -> Array:
+    def R_wb(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """[N, 3, 3] body in the world."""
         ...
 
-    def R_wc(self, t: Array) -> Array:
+    def R_wc(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """[N, 3, 3] camera in the world."""
         ...
 
-    def rate_b(self, t: Array) -> Array:
+    def rate_b(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """[N, 3] rad/s in the body frame."""
         ...
 

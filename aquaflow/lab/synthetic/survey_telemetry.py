@@ -34,8 +34,11 @@ OMEGA = 2.0 * np.pi / SWAY_S
 class SurveyPath:
     """A survey's motion as functions of time; see :class:`aquaflow.lab.synthetic.path.Path`."""
 
-    def __init__(self, survey: SurveyPictures, R_bc: Array) -> None:
-        """``R_bc`` [3, 3]: camera axes in the body, in truth."""
+    def __init__(
+        self,
+        survey: SurveyPictures,
+        R_bc: Array,  # [3, 3] camera axes in the body, in truth
+    ) -> None:
         self._plan, self._R_bc = survey.plan, R_bc
         self.R_ws = np.eye(3)
         self.t_ws = np.array([0.0, 0.0, DEPTH_M + ALTITUDE_M])

@@ -82,7 +82,13 @@ def jobs_of(
     written = None if settings is None else str(settings)
     jobs = [
         GrowthJob(
-            count, width, str(out / f"dive_{count}"), preset, tracking_only, scene, telemetry,
+            count,
+            width,
+            str(out / f"dive_{count}"),
+            preset,
+            tracking_only,
+            scene,
+            telemetry,
             written,
         )
         for count in sorted(set(frames))

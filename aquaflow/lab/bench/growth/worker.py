@@ -7,6 +7,7 @@ output is the row as JSON.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,11 +25,18 @@ from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.views import open_finished
 from aquaflow.geometry.arrays import Arrays, add_prefix, of_sim3
-from aquaflow.lab.bench.growth.job import THREADS, GrowthJob
+from aquaflow.lab.bench.growth.job import ABOARD, THREADS, GrowthJob
 from aquaflow.lab.bench.job import answer
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
-from aquaflow.lab.synthetic.survey import SurveyPictures
+from aquaflow.lab.evaluation.trajectory_error import absolute_error
+from aquaflow.lab.synthetic.survey import FPS, SurveyPictures
+from aquaflow.lab.synthetic.survey_plan import plan_of
+from aquaflow.lab.synthetic.survey_telemetry import SurveyTelemetry
 from aquaflow.mapping import state
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.render.image_metrics import psnr
+from aquaflow.render.transfers import picture_out
+from aquaflow.render.views import View
 from aquaflow.slam import Slam
 
 
@@ -38,7 +46,8 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     Raises:
         AquaFlowError: the run failed; the sentence says why.
     """
-    config, survey = job.config(), SurveyPictures(job.width)
+    config = job.config()
+    survey = SurveyPictures(job.width, plan=plan_of(job.scene, job.frames / FPS))
     fix_threads(THREADS, config)
     start_mb = resident_mb()
     folder = DiveFolder(Path(job.out), config, overwrite=True)
@@ -46,7 +55,8 @@ def perform(job: GrowthJob) -> dict[str, Any]:
         slam = Slam(config, Stages(Profiler(clock=time.thread_time)), folder.work)
         try:
             run = DiveRun("survey", folder, config, slam, survey.camera, survey.name_of)
-            row = _measure_dive(run, survey, job.frames) | _finish_run(run)
+            row = _measure_dive(run, survey, job) | _finish_run(run)
+            row |= {"psnr_in_the_end": mean_psnr(slam, job.frames), **path_errors(run, survey)}
             folder.set_finished()
         finally:
             slam.close()
@@ -59,10 +69,17 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     return row
 
 
-def _measure_dive(run: DiveRun, survey: SurveyPictures, frames: int) -> dict[str, Any]:
+def _measure_dive(run: DiveRun, survey: SurveyPictures, job: GrowthJob) -> dict[str, Any]:
     """What there is when the last frame is in."""
-    meter = TenthsMeter(run, frames)
-    for frame in survey.frames(frames):
+    telemetry = SurveyTelemetry(survey)
+    if job.telemetry != "none":
+        run.slam.metric.mounting = telemetry.mountings.stated
+    samples = telemetry.samples(job.frames / FPS, ABOARD[job.telemetry])
+    meter, waiting = TenthsMeter(run, job.frames), next(samples, None)
+    for frame in survey.frames(job.frames):
+        while waiting is not None and waiting.arrival_ns <= frame.arrival_ns:
+            run.sample(waiting)
+            waiting = next(samples, None)
         run.frame(frame)
         meter.frame_done()
     path = run.folder.path
@@ -84,6 +101,66 @@ def _finish_run(run: DiveRun) -> dict[str, Any]:
         "finish_cpu_s": round(time.process_time() - began_s, 3),
         **{key: metrics[key] for key in ("tracked", "lost", "gaussians", "psnr")},
     }
+
+
+# --------------------------------------------------------------------------------------------------
+# How right the map is along the dive, and the path as a whole.
+
+
+def path_errors(run: DiveRun, survey: SurveyPictures) -> dict[str, Any]:
+    """RMS error of all positions over the length of the way, percent: ``ate_world_pct`` of the
+    sub-maps as telemetry lays them into the world, in metres, ``ate_sub_maps_pct`` with each in a
+    frame and unit of its own; None where there is none. And ``sub_maps``, their frames."""
+    frames = run.slam.metric_frames()
+    posed = [each for each in run.results if each.T_wc is not None]
+    truth = np.array([survey.T_wc(each.frame.index).t for each in posed])
+    found = np.array([each.T_wc.t for each in posed if each.T_wc is not None])
+    of = np.array([each.sub_map for each in posed])
+    length = float(np.linalg.norm(np.diff(truth, axis=0), axis=1).sum())
+    squared, counts = 0.0, dict[str, int]()
+    for number in np.unique(of).tolist():
+        counts[str(number)] = int((of == number).sum())
+        mine = of == number
+        if counts[str(number)] > LEAST_ALIGNED:
+            error = absolute_error(found[mine], truth[mine], length, with_scale=True)
+            squared += counts[str(number)] * error.rmse**2
+    aligned = sum(count for count in counts.values() if count > LEAST_ALIGNED)
+    placed = {n: frame.T_nm for n, frame in frames.items() if frame.metric}
+    world = np.array([number in placed for number in of.tolist()], dtype=bool)
+    ate_world = None
+    if world.sum() > LEAST_ALIGNED:
+        pairs = zip(of[world].tolist(), found[world], strict=True)
+        laid = np.array([placed[n].apply(p) for n, p in pairs])
+        ate_world = absolute_error(laid, truth[world], length, with_scale=False).pct
+    ate = 100.0 * math.sqrt(squared / aligned) / length if aligned else None
+    return {
+        "path_m": length,
+        "sub_maps": counts,
+        "ate_world_pct": ate_world,
+        "ate_sub_maps_pct": ate,
+    }
+
+
+LEAST_ALIGNED = 10
+"""Poses of a sub-map that say where it lies."""
+
+
+def mean_psnr(slam: Slam, frames: int) -> list[float | None]:
+    """dB in each tenth of the dive of views that were never mapped, from the map as it is."""
+    rows: list[list[float]] = [[] for _ in range(TENTHS)]
+    for number, views in slam.held_out.items():
+        if number in slam.mappers and len(slam.mappers[number].gaussians):
+            for view in views:
+                tenth = min(view.frame_index * TENTHS // frames, TENTHS - 1)
+                rows[tenth].append(psnr_of(slam.mappers[number], view))
+    return [round(float(np.mean(row)), 2) if row else None for row in rows]
+
+
+def psnr_of(mapper: Mapper, view: View) -> float:
+    """dB of a view that was never mapped, where its pose is now."""
+    mapper.take_light(view)
+    shown = mapper.show(view).image.clamp(0.0, 1.0)
+    return psnr(picture_out(shown), picture_out(view.target()))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -165,11 +242,14 @@ GRAPH = ("graph", "correct")
 """Stages of the profiler; the graph has all that other threads spend as well."""
 TENTHS = 10
 """Parts of a dive that are looked at."""
+LOOKS = 100
+"""Times in a dive at which the newest held-out view is compared with the map."""
 
 
 Tenth = dict[str, float | None]
 """``tracking_ms``, ``mapping_ms`` and ``graph_ms``, means over the frames of a tenth; at its end
-``frames``, ``keyframes``, ``gaussians`` and ``resident_mb`` (None where unknown)."""
+``frames``, ``keyframes``, ``gaussians``, ``resident_mb`` (None where unknown), ``work_bytes`` and
+``psnr``, dB of views that were just held out."""
 
 
 @dataclass(frozen=True)
@@ -192,14 +272,27 @@ class TenthsMeter:
         self.tenths: list[Tenth] = []
         self._run, self._frames = run, frames
         self._done, self._last, self._before = 0, 0, _Spent.now(run)
+        self._looks, self._psnr = 0, list[float]()
 
     def frame_done(self) -> None:
         """Count a frame."""
         self._done += 1
+        if self._done * LOOKS >= (self._looks + 1) * self._frames:
+            self._look()
         if self._done * TENTHS >= (len(self.tenths) + 1) * self._frames:
             self.tenths.append(self._tenth())
 
+    def _look(self) -> None:
+        """At the newest held-out view, from the map as it is by now."""
+        self._looks += 1
+        slam = self._run.slam
+        number = slam.tracker.sub_map
+        views = slam.held_out.get(number)
+        if views and number in slam.mappers and len(slam.mappers[number].gaussians):
+            self._psnr.append(psnr_of(slam.mappers[number], views[-1]))
+
     def _tenth(self) -> Tenth:
+        seen, self._psnr = self._psnr, []
         spent, before, count = _Spent.now(self._run), self._before, self._done - self._last
         self._before, self._last = spent, self._done
 
@@ -216,8 +309,10 @@ class TenthsMeter:
             "mapping_ms": round(mean_ms(MAPPING), 3),
             "graph_ms": round(mean_ms(GRAPH) + elsewhere / count, 3),
             "keyframes": len(slam.keyframes),
-            "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
+            "gaussians": sum(mapper.count for mapper in slam.mappers.values()),
             "resident_mb": resident_mb(),
+            "work_bytes": folder_bytes(self._run.folder.path),
+            "psnr": round(float(np.mean(seen)), 2) if seen else None,
         }
 
 
