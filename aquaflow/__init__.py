@@ -18,6 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from aquaflow.api.export import export
     from aquaflow.api.map import Map, load_map
     from aquaflow.api.measure import measure
     from aquaflow.api.recording import map_recording
@@ -46,6 +47,7 @@ __all__ = [
     "__version__",
     "align",
     "associate",
+    "export",
     "guess_camera",
     "load_map",
     "map_recording",
@@ -66,6 +68,7 @@ _HOMES = {
     "Trajectory": "aquaflow.dive.tum",
     "align": "aquaflow.geometry.alignment",
     "associate": "aquaflow.dive.tum",
+    "export": "aquaflow.api.export",
     "guess_camera": "aquaflow.geometry.camera",
     "load_map": "aquaflow.api.map",
     "map_recording": "aquaflow.api.recording",

@@ -100,8 +100,36 @@ def test_measures_are_those_of_the_command(small_dive: Path, command: Cli) -> No
         aquaflow.measure(dive, ["here", "there"])
 
 
+def test_exports_are_those_of_the_command(small_dive: Path, command: Cli, tmp_path: Path) -> None:
+    asked = ("--format", "ply,laz", "--resolution", 0.3, "--water")
+    ran = command("export", small_dive, *asked, "--out", tmp_path / "cli", "--json")
+    stages = set()
+    found = aquaflow.export(
+        aquaflow.read_dive(small_dive),
+        ["ply", "laz"],
+        tmp_path / "api",
+        resolution=0.3,
+        water=True,
+        progress=lambda stage, done, total: stages.add(stage),
+    )
+    said = json.loads(ran.out.replace(str(tmp_path / "cli"), str(tmp_path / "api")))
+    assert found == said
+    assert set(found) == {"laz", "ply"}
+    assert "laz" in stages
+    for name in ("mesh.ply", "points.laz"):
+        assert (tmp_path / "api" / name).read_bytes() == (tmp_path / "cli" / name).read_bytes()
+    with pytest.raises(aquaflow.AquaFlowError, match="'tiff' is no --format"):
+        aquaflow.export(small_dive, "laz,tiff", tmp_path / "none")
+    with pytest.raises(aquaflow.AquaFlowError, match="knows no --resolution"):
+        aquaflow.export(small_dive, "laz", tmp_path / "none", resolution=0.3)
+    assert not (tmp_path / "none").exists()
+
+
 def test_a_folder_without_a_dive_is_refused_with_its_path(tmp_path: Path) -> None:
-    for read in (aquaflow.read_dive, aquaflow.load_map, aquaflow.measure):
+    def export(dive: Path) -> None:
+        aquaflow.export(dive, "all")
+
+    for read in (aquaflow.read_dive, aquaflow.load_map, aquaflow.measure, export):
         with pytest.raises(aquaflow.AquaFlowError, match=str(tmp_path)):
             read(tmp_path)
 

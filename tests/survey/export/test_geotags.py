@@ -13,8 +13,8 @@ from pyproj import Geod, Proj
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
-from aquaflow.cli.export import ExportFormat, all_formats
 from aquaflow.dive.dive import Dive
+from aquaflow.survey.export.formats import ExportFormat, all_formats
 from aquaflow.survey.export.geotags import attitudes, read_geotags, write_geo_txt
 from aquaflow.telemetry.metric_file import write_metric_file
 from tests.command_line import Cli, refused

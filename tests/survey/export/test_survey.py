@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 from aquaflow.base.errors import ArgumentError, InputError
 from aquaflow.cli import app
-from aquaflow.cli.export import ExportFormat
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.shown_views import on_ground
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.survey.export.formats import ExportFormat
 from aquaflow.survey.export.ortho import grid as grid_module
 from aquaflow.survey.export.ortho.survey import export_survey
 from aquaflow.telemetry.world_frame import WorldFrame
