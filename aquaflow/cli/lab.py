@@ -62,7 +62,7 @@ def synth(
 
     from aquaflow.base.errors import ArgumentError, words_of
     from aquaflow.lab.synthetic.config import SyntheticConfig
-    from aquaflow.lab.synthetic.dive import write_dive
+    from aquaflow.lab.synthetic.dive import POSITIONS, write_dive
 
     asked = {
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
@@ -80,7 +80,10 @@ def synth(
     if as_json:
         typer.echo(json.dumps({"out": str(out), "frames": config.frames}))
     else:
-        typer.echo(f"Wrote {config.frames} pictures with their truth to {out}.")
+        typer.echo(
+            f"Wrote {config.frames} pictures with their truth to {out}.\nTo map it on the earth: "
+            f"--telemetry {out / POSITIONS} --telemetry-offset 0"
+        )
 
 
 def evaluate(

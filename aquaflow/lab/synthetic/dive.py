@@ -29,7 +29,7 @@ from aquaflow.lab.synthetic.range_effects import with_range_effects
 from aquaflow.lab.synthetic.sensor import Snow, expose, quantise, vignette
 from aquaflow.lab.synthetic.site import SurveySite, camera_of, site_of
 from aquaflow.lab.synthetic.streams import stream
-from aquaflow.lab.synthetic.telemetry.measurement import measure
+from aquaflow.lab.synthetic.telemetry.measurement import measure, write_positions
 from aquaflow.lab.synthetic.telemetry.series import Constants, draw_constants
 from aquaflow.lab.synthetic.telemetry.sonar import Sonar
 from aquaflow.lab.synthetic.texture import MipAtlas
@@ -41,6 +41,9 @@ __all__ = ["FORMAT_VERSION", "build", "camera_of", "write_dive"]
 
 MARKER = "synth.yaml"
 """The file by which a folder is known to be a synthetic dive."""
+
+POSITIONS = "positions.csv"
+"""Fixes in a table of their own: a dive is on the earth only where its user wants it."""
 
 FORMAT_VERSION = 4
 """Of the files and of the generator: the same config gives the same dive within a version."""
@@ -114,6 +117,7 @@ def _write_tables(out: Path, config: SyntheticConfig, site: SurveySite) -> None:
     constants = draw_constants(config)
     sonar = Sonar(site.relief.area, site.crests)
     write_telemetry(out / "telemetry.csv", measure(config, site.motion, sonar, constants))
+    write_positions(out / POSITIONS, config, site.motion)
     (out / MARKER).write_text(
         yaml.safe_dump(_truth_values(config, site, constants), sort_keys=False)
     )

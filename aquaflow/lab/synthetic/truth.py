@@ -9,9 +9,10 @@ The folder of a dive:
   nothing is hit) and ``hit`` bool [H, W]; ``moving`` bool [H, W] where fish or an arm are seen, if
   any are;
 - ``camera.yaml``, ``timestamps.txt`` (s, a line per picture), ``poses.tum`` (t_s tx ty tz qx qy qz
-  qw, camera to world), ``medium.yaml`` (the water), ``telemetry.csv``, ``synth.yaml`` (the config,
-  the version, how the camera is mounted as a user believes it, and under ``truth`` the true
-  mountings and constant errors of the instruments).
+  qw, camera to world), ``medium.yaml`` (the water), ``telemetry.csv``, ``positions.csv`` (fixes for
+  who wants the dive on the earth), ``synth.yaml`` (the config, the version, how the camera is
+  mounted as a user believes it, and under ``truth`` the true mountings and constant errors of the
+  instruments).
 """
 
 from __future__ import annotations

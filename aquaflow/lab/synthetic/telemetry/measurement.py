@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from aquaflow.base.storage.table import csv_text
 from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.motion import GRAVITY_M_S2, TrueBodyMotion
@@ -34,6 +36,8 @@ Measure: TypeAlias = Callable[
 
 SOURCE = "synthetic"
 """The instruments' name in samples."""
+POSITIONS_HZ = 2.0
+"""Of the fixes in a table of their own: the shortest dive that maps, of a second, has some."""
 
 
 def measure(
@@ -192,6 +196,20 @@ def position(
     sigma = np.full((len(t), 1), noise.position_sigma_m)
     found = np.hstack([_on_earth(place, noise), sigma])
     return np.where(heard_from[:, None] < 0.0, np.nan, found)
+
+
+def write_positions(path: Path, config: SyntheticConfig, motion: TrueBodyMotion) -> None:
+    """The fixes as a plain table (aquaflow/recordings/csv_telemetry.py), ``POSITIONS_HZ`` a second
+    unless ``position_hz`` says otherwise."""
+    noise, last = config.telemetry, (config.frames - 1) / config.fps
+    rate_hz = noise.position_hz or POSITIONS_HZ
+    t = np.arange(int(last * rate_hz + 1e-9) + 1) / rate_hz
+    fixes = position(t, motion, noise, instrument_stream(config.seed, "position"))
+    lines = [("t_s", "latitude_deg", "longitude_deg", "sigma_m")]
+    for t_s, (latitude, longitude, sigma) in zip(t, fixes, strict=True):
+        if np.isfinite(latitude):
+            lines.append((f"{t_s:.9f}", f"{latitude:.9f}", f"{longitude:.9f}", f"{sigma:g}"))
+    path.write_text(csv_text(lines), encoding="utf-8")
 
 
 def utc_time(
