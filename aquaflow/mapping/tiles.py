@@ -87,7 +87,10 @@ class TileFiles:
         """False without a folder: nothing can leave memory."""
         return self._folder is not None
 
-    def write(self, arrays: Arrays) -> int:
+    def write(
+        self,
+        arrays: Arrays,  # by name, of any shape
+    ) -> int:
         """The number of a new file; where there is no room on the disk it stays in memory."""
         number, self._next = self._next, self._next + 1
         self._spill[number] = arrays
@@ -185,8 +188,9 @@ class Tiles:
         for i in np.argsort(-apart, kind="stable").tolist():
             if left >= least or apart[i] <= 0.0:
                 break
-            chosen.append(int(owners[i]))
-            left += int(counts[i])
+            if owners[i] not in self.waiting:  # a keyframe has one file
+                chosen.append(int(owners[i]))
+                left += int(counts[i])
         return chosen
 
     def around(
@@ -201,7 +205,8 @@ class Tiles:
         sizes = np.concatenate([counts, [self.waiting[n].count for n in out]])[order]
         near = order[np.cumsum(sizes) <= room]
         chosen = {[*inside, *out][i] for i in near.tolist()}
-        return [n for n in inside if n not in chosen], [n for n in out if n in chosen]
+        leaving = [n for n in inside if n not in chosen and n not in self.waiting]
+        return leaving, [n for n in out if n in chosen]
 
     def leave(
         self, gaussians: GaussianMap, adam: SelectiveAdam, keyframes: Sequence[int]
@@ -283,7 +288,10 @@ class Tiles:
             "seen": np.array(list(self.seen), np.int64),
         }
 
-    def restore(self, arrays: Arrays) -> int:
+    def restore(
+        self,
+        arrays: Arrays,  # as from serialise
+    ) -> int:
         """Take up what a checkpoint has; the number of Gaussians whose file was lost."""
         spheres = [Sphere(row[:3].copy(), float(row[3])) for row in arrays["spheres"]]
         rows = zip(arrays["waiting"].tolist(), arrays["moves"], spheres, strict=False)

@@ -232,3 +232,18 @@ def test_a_map_that_is_absorbed_brings_its_tiles(tmp_path: Path) -> None:
     before = len(mapper.gaussians)
     mapper.gather()
     assert len(mapper.gaussians) > before
+
+
+def test_a_keyframe_whose_tile_waits_keeps_what_it_inserts_later(tmp_path: Path) -> None:
+    mapper = mapped(12, tmp_path, 100_000).mappers[0]
+    before = int((mapper.gaussians.keyframes == 0).sum())
+    mapper._release([0])
+    again = {name: tensor[:5].clone() for name, tensor in mapper.gaussians.parameters.items()}
+    again["means"] -= 100.0
+    mapper.gaussians.extend(again, 0)
+    mapper.optimiser.extend(5, None)
+    ground = mapper.tiles.seen[11]
+    assert 0 not in mapper.tiles.far(mapper.gaussians, ground, 10**6)
+    assert 0 not in mapper.tiles.around(mapper.gaussians, ground, 0)[0]
+    mapper.gather()
+    assert int((mapper.gaussians.keyframes == 0).sum()) == before + 5
