@@ -64,9 +64,9 @@ class CurrentKeyframe:
     """[H, W] of ``image``."""
     T_fk: Sim3 = field(default_factory=Sim3.identity)
     motion: Sim3 = field(default_factory=Sim3.identity)
-    """From the frame before to the last one."""
-    measured: bool = False
-    """True if ``motion`` is the next frame's by gyro or DVL, not the last one's again."""
+    """From the frame before to the last one; while a frame is placed, what it is expected to be."""
+    interval_ns: int = 0
+    """Between the frames of ``motion``; 0 while it is not known."""
     matches: Float | None = None
     """[H, W, 2] px of the last frame: where the next one's are looked for."""
     t_ns: int = 0
@@ -81,6 +81,17 @@ class CurrentKeyframe:
     def T_wc(self) -> Sim3:
         """Pose of the last frame."""
         return self.keyframe.T_wc @ self.T_fk.inverse()
+
+    def expect(self, t_ns: int, measured: Sim3 | None) -> None:
+        """Set the ``motion`` until ``t_ns``: as telemetry measured it, or the last one's again, as
+        much longer or shorter as the time since then."""
+        interval_ns = t_ns - self.t_ns if self.t_ns > 0 else 0
+        if measured is not None:
+            self.motion = measured
+        elif interval_ns > 0 and self.interval_ns > 0:
+            stretch = min(interval_ns / self.interval_ns, MOST_STRETCH)
+            self.motion = Sim3.exp(stretch * self.motion.log())
+        self.interval_ns = interval_ns
 
     def moved_to(
         self,
@@ -111,6 +122,8 @@ def only_where(
     return replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
 
 
+MOST_STRETCH = 4.0
+"""Times as long as the last motion's interval: a vehicle may have turned since then."""
 SCARCE = 3.0
 """Times ``min_support``: a keyframe that shows less of a frame is left, whatever hides it; another
 such step, and the camera is lost."""
@@ -164,11 +177,11 @@ class KeyframeTracker:
         return turned or (None if by_chance else solved)
 
     def _seed(self, at: CurrentKeyframe, predicted: Sim3, camera: CameraModel) -> Float | None:
-        """Where the frame's matches are looked for first: at the last ones, or, where telemetry
-        measured a wide motion since then, where that leads to."""
+        """Where the frame's matches are looked for first: at the last ones, or, where a wide motion
+        is expected since then, where that leads to."""
         if not self._config.seed_matching:
             return None
-        if at.measured and is_wide(at.keyframe.pointmap, at.T_fk, predicted, camera):
+        if is_wide(at.keyframe.pointmap, at.T_fk, predicted, camera):
             return expected_matches(at.keyframe.pointmap, predicted, camera)
         return at.matches
 

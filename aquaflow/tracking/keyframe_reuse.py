@@ -173,4 +173,4 @@ def carry(back: CurrentKeyframe, look: ReuseRequest) -> None:
     unit = at.keyframe.T_wc.scale / back.keyframe.T_wc.scale
     back.T_fk = Sim3(since.R, unit * since.t) @ back.T_fk
     back.matches = expected_matches(back.keyframe.pointmap, back.T_fk, look.camera)
-    back.motion, back.t_ns = at.motion, at.t_ns
+    back.motion, back.t_ns, back.interval_ns = at.motion, at.t_ns, at.interval_ns

@@ -430,13 +430,12 @@ class Tracker:
         return None
 
     def _expect(self, at: CurrentKeyframe, frame: Frame) -> None:
-        """Replace the motion that is expected, the last one again, by what telemetry measured."""
+        """Set the motion that is expected since the last frame."""
         motion = None
         if self._motion is not None and at.t_ns > 0:
             with self._failures.contain("expected motion", frame.index):
                 motion = self._motion(at.keyframe, at.t_ns, frame.t_ns, at.motion)
-        at.measured = motion is not None
-        at.motion = motion or at.motion
+        at.expect(frame.t_ns, motion)
 
     def _place(self, frame: Frame, encoding: Encoding, pair: PairGeometry | None) -> Tracked | None:
         assert self._at is not None
@@ -478,5 +477,6 @@ class Tracker:
         self._joined.add((len(self._keyframes), at.keyframe.number))
         new = keyframe_tracker.at_new_keyframe
         self._at = new(frame, encoding, at.T_wc, pointmap, self.sub_map, at.motion)
+        self._at.interval_ns = at.interval_ns
         self._edges.links[self._at.keyframe.number] = link
         return self._at.tracked_result(frame, frame_class, solved.quality, pointmap.copy())

@@ -15,7 +15,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow_pair import FlowPair
-from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
+from aquaflow.tracking.current_keyframe import MOST_STRETCH, CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.pose.matcher import KeyframeMatcher, Visibility
 from aquaflow.tracking.wide_steps import WideSteps, keypoint_poses
 from aquaflow.types import Frame
@@ -300,3 +300,37 @@ def test_steps_of_half_a_view_stay_in_one_map(
     monkeypatch.setattr(KeyframeTracker, "place_after_turn", lambda *given: given[-1])
     without = run(frames)
     assert any(t.T_wc is None for t in without.tracked) or without.tracker.sub_maps > 1
+
+
+# --- the motion that is expected ------------------------------------------------------------------
+
+STEP = np.array([0.02, 0.0, 0.01, 0.0, 0.01, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("t_ns", "times"), [(300, 1.0), (400, 2.0), (10_000, MOST_STRETCH)])
+def test_the_last_motion_is_expected_again_for_as_long_as_the_time_since(
+    t_ns: int, times: float
+) -> None:
+    keyframe = keyframe_at(HERE, KeyframeStore())
+    at = CurrentKeyframe(keyframe, motion=Sim3.exp(STEP), t_ns=200, interval_ns=100)
+    at.expect(t_ns, None)
+    np.testing.assert_allclose(at.motion.log(), times * STEP, atol=1e-9)
+
+
+def test_a_frame_without_a_pose_stretches_the_motion_no_more_than_the_time() -> None:
+    keyframe = keyframe_at(HERE, KeyframeStore())
+    at = CurrentKeyframe(keyframe, motion=Sim3.exp(STEP), t_ns=200, interval_ns=100)
+    at.expect(300, None)
+    at.expect(400, None)
+    np.testing.assert_allclose(at.motion.log(), 2.0 * STEP, atol=1e-9)
+
+
+def test_a_wide_step_like_the_last_one_needs_one_flow_and_no_keypoints() -> None:
+    store = KeyframeStore()
+    step = pose((0.0, 0.0, 0.0), (-0.6, 0.0, 0.0))
+    at = CurrentKeyframe(keyframe_at(HERE, store), motion=step)
+    frame = PRIOR.encode(FLOOR.picture(step.inverse()), CAMERA)
+    solved = KeyframeTracker(PRIOR, store, TrackingConfig()).place(at, frame, CAMERA)
+    assert solved is not None
+    assert shift_px(solved.estimate.T, step) < 0.5
+    assert "keypoints" not in vars(frame)
