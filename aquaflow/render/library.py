@@ -39,6 +39,8 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_fuse_depths": (_INT, [_POINTER]),
     "aq_fuse_ranges": (_INT, [_POINTER]),
     "aq_pose_equations": (_INT, [_POINTER] * 3),
+    "aq_anchor_errors": (_INT, [_POINTER] * 2),
+    "aq_anchor_equations": (_INT, [_POINTER] * 2),
     "aq_project_rays": (_INT, [_POINTER, _INT]),
     "aq_search_descriptors": (_INT, [_POINTER, _INT]),
     "aq_refine_flow": (

@@ -11,6 +11,7 @@
 
 #include "activate.h"
 #include "adam.h"
+#include "anchor_equations.h"
 #include "blend.h"
 #include "check_flow.h"
 #include "constants.h"
@@ -281,6 +282,17 @@ AQ_EXPORT int aq_fuse_ranges(const FuseRanges* in) {
 AQ_EXPORT int aq_pose_equations(const PoseEquations* in, PoseResult* out, const PoseLeft* left) {
   pose_equations(*in, *out, left);
   return 0;
+}
+
+// See anchor_equations.h: lengths [views, points] of what is left of an anchor's matches.
+AQ_EXPORT int aq_anchor_errors(const AnchorProblem* in, double* length) {
+  anchor_errors(*in, length);
+  return 0;
+}
+
+// See anchor_equations.h: an anchor's part of the normal equations, its depths eliminated.
+AQ_EXPORT int aq_anchor_equations(const AnchorProblem* in, const AnchorSums* out) {
+  return guarded([&] { anchor_equations(*in, *out); });
 }
 
 // See adam.h. Returns the number of visible rows skipped for a non-finite gradient.

@@ -11,6 +11,7 @@ depths: what a keyframe's pointmap says, in its own unit.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -22,6 +23,7 @@ from aquaflow.geometry.similarity import Sim3Batch, hat, right_jacobian_inverse
 from aquaflow.keyframes import Pointmap
 from aquaflow.optimise.robust import HUBER_LENGTH, Huber
 from aquaflow.prior.contract import PairGeometry
+from aquaflow.render.library import Library, library_or_none
 
 Array = npt.NDArray[np.float64]
 Float = npt.NDArray[np.float32]
@@ -86,13 +88,17 @@ def project(
     rho: Array,  # [P]
 ) -> Projected:
     """Project the points of an anchor into the views that see them."""
-    count = len(matches.views)
-    T_va = poses[matches.views].inverse() @ poses[np.full(count, matches.anchor)]
+    T_va = _views_from_anchor(matches, poses)
     R = T_va.scale[:, None, None] * T_va.R
     Y = matches.rays @ R.transpose(0, 2, 1) + rho[None, :, None] * T_va.t[:, None, :]
     z = np.maximum(Y[..., 2], MIN_Z)
     error = np.where(matches.used[..., None], Y[..., :2] / z[..., None] - matches.at, 0.0)
     return Projected(R, T_va.t, Y, z, error)
+
+
+def _views_from_anchor(matches: AnchorMatches, poses: Sim3Batch) -> Sim3Batch:
+    """[V] from the anchor to each view."""
+    return poses[matches.views].inverse() @ poses[np.full(len(matches.views), matches.anchor)]
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,30 @@ def equations_and_scores(
     rho: Array,  # [P]
 ) -> tuple[AnchorEquations, Array]:
     """The same, and [P, n] what each point adds to the gradient: as large as all the rest."""
+    library = library_or_none()
+    if library is None:
+        return equations_by_definition(matches, poses, rho)
+    return _CompiledAnchor(library, matches, poses, rho).equations()
+
+
+def error_lengths(
+    matches: AnchorMatches,
+    poses: Sim3Batch,
+    rho: Array,  # [P]
+) -> Array:
+    """[V, P] lengths of what is left of the matches, normalised plane; 0 where nothing is seen."""
+    library = library_or_none()
+    if library is None:
+        return np.asarray(np.linalg.norm(project(matches, poses, rho).error, axis=-1))
+    return _CompiledAnchor(library, matches, poses, rho).error_lengths()
+
+
+def equations_by_definition(
+    matches: AnchorMatches,
+    poses: Sim3Batch,
+    rho: Array,  # [P]
+) -> tuple[AnchorEquations, Array]:
+    """:func:`equations_and_scores` step by step."""
     at = project(matches, poses, rho)
     by_point = _by_point(at)
     by_view = -_point_derivatives(by_point, at.Y, rho)
@@ -197,6 +227,67 @@ def _point_derivatives(
     turned = -by_point @ hat(Y)
     grown = np.einsum("vpij,vpj->vpi", by_point, Y)[..., None]
     return np.concatenate([by_point * rho[None, :, None, None], turned, grown], axis=-1)
+
+
+# --------------------------------------------------------------------------------------------------
+# The same in compiled code (native/anchor_equations.h): half of what tracking without a map took
+# was the definition (notes/2026-11-speed.md#small-computer).
+
+_COLUMNS = ("R", "t", "rays", "rho", "at", "sigma", "used", "known", "variance")
+
+
+class _Problem(ctypes.Structure):
+    """``AnchorProblem`` of native/anchor_equations.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in _COLUMNS),
+        *((name, ctypes.c_int32) for name in ("views", "points")),
+        *((name, ctypes.c_double) for name in ("min_z", "huber", "least_curvature")),
+    )
+
+
+class _Sums(ctypes.Structure):
+    """``AnchorSums`` of the same file."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_void_p) for name in ("H", "gradient", "gain", "offset", "scores")
+    )
+
+
+class _CompiledAnchor:
+    """An anchor's matches at some poses and inverse depths [P]."""
+
+    def __init__(
+        self, library: Library, matches: AnchorMatches, poses: Sim3Batch, rho: Array
+    ) -> None:
+        T_va = _views_from_anchor(matches, poses)
+        numbers = (
+            T_va.scale[:, None, None] * T_va.R, T_va.t, matches.rays, rho, matches.at,
+            matches.sigma, matches.used, matches.rho, matches.variance,
+        )  # fmt: skip
+        self._columns = [
+            np.ascontiguousarray(each, bool if name == "used" else np.float64)
+            for name, each in zip(_COLUMNS, numbers, strict=True)
+        ]
+        self._library, self._shape = library, matches.used.shape
+        addresses = [each.ctypes.data for each in self._columns]
+        limits = (MIN_Z, KERNEL.bound, LEAST_CURVATURE)
+        self._given = _Problem(*addresses, *matches.used.shape, *limits)
+
+    def error_lengths(self) -> Array:
+        lengths = np.empty(self._shape)
+        given = ctypes.byref(self._given)
+        self._library.call("aq_anchor_errors", given, lengths.ctypes.data)
+        return lengths
+
+    def equations(self) -> tuple[AnchorEquations, Array]:
+        views, points = self._shape
+        n = 7 * (1 + views)
+        shapes = ((n, n), (n,), (points, n), (points,), (points, n))
+        H, gradient, gain, offset, scores = sums = [np.empty(shape) for shape in shapes]
+        out = _Sums(*(each.ctypes.data for each in sums))
+        self._library.call("aq_anchor_equations", ctypes.byref(self._given), ctypes.byref(out))
+        return AnchorEquations(H, gradient, gain, offset), scores
 
 
 # --------------------------------------------------------------------------------------------------

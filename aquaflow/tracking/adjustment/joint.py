@@ -24,6 +24,7 @@ from aquaflow.tracking.adjustment.equations import (
     Mask,
     anchor_equations,
     equations_and_scores,
+    error_lengths,
     project,
 )
 
@@ -119,7 +120,7 @@ def _with_noise(
     rho: Array,  # [P]
 ) -> AnchorMatches:
     """The noise of every pair's matches from what is left of them; pairs of few are left out."""
-    size = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
+    size = error_lengths(matches, poses, rho)
     many = matches.used.sum(axis=1) >= FEW
     sigma = np.array([
         max(sigma_of_lengths(row[used]), LEAST_SIGMA) if enough else 1.0
@@ -133,7 +134,7 @@ def _without_outliers(
     poses: Sim3Batch,
     rho: Array,  # [P]
 ) -> AnchorMatches:
-    size = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
+    size = error_lengths(matches, poses, rho)
     near = size < OUTLIER_SIGMAS * matches.sigma[:, None]
     return replace(matches, used=matches.used & near)
 
@@ -151,8 +152,7 @@ def held_out_errors(matches: Sequence[AnchorMatches], poses: Sim3Batch) -> list[
     """[V, P] lengths of the errors in sigmas of every anchor; NaN where nothing is seen."""
     errors = []
     for anchor in matches:
-        error = project(anchor, poses, triangulate(anchor, poses)).error
-        size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
+        size = error_lengths(anchor, poses, triangulate(anchor, poses)) / anchor.sigma[:, None]
         errors.append(np.where(anchor.used, size, np.nan))
     return errors
 
@@ -256,8 +256,7 @@ def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) 
     """Robust cost of all matches, and of the depths' departure from the pointmaps."""
     total = links.cost(state.poses)
     for anchor, rho in zip(matches, state.rho, strict=True):
-        error = project(anchor, state.poses, rho).error
-        size = np.linalg.norm(error, axis=-1) / anchor.sigma[:, None]
+        size = error_lengths(anchor, state.poses, rho) / anchor.sigma[:, None]
         total += float(KERNEL.cost(size).sum())
         total += 0.5 * float(((rho - anchor.rho) ** 2 / anchor.variance).sum())
     return total

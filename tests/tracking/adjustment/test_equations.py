@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
+from aquaflow.render.library import load_library
 from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     Links,
     anchor_equations,
     equations_and_scores,
+    equations_by_definition,
+    error_lengths,
     project,
 )
 from aquaflow.tracking.adjustment.joint import BlockPattern, BundleState, cost_of, linearise
@@ -140,3 +143,45 @@ def test_sums_of_blocks_are_those_of_a_dense_matrix() -> None:
     assert np.allclose(system.H.toarray(), H[np.ix_(own, own)], rtol=1e-12, atol=1e-9)
     assert np.allclose(system.gradient, gradient[own], rtol=1e-12, atol=1e-9)
     assert len(pattern.keys) < 16  # no point is seen by keyframes 1 and 5
+
+
+def unlucky(seed: int) -> tuple[AnchorMatches, Sim3Batch, Array]:
+    """Outliers, points that some or no views see or that are behind one, unknown depths."""
+    known = scene(count=5, noise=1e-3)
+    random = np.random.default_rng(seed)
+    matches, rho = known.matches[1], known.rho[1] * random.lognormal(0.0, 0.3, len(known.rho[1]))
+    used = matches.used & (random.random(matches.used.shape) < 0.8)
+    used[:, :5] = False
+    at = np.where(used[..., None], matches.at + 0.1 * (random.random(used.shape) < 0.1)[..., None],
+                  np.nan)  # fmt: skip
+    rho[5:9] = -3.0
+    variance = np.where(random.random(len(rho)) < 0.3, np.inf, (0.1 * rho) ** 2)
+    changed = replace(matches, used=used, at=at.astype(np.float32), variance=variance)
+    return changed, Sim3Batch.of(shaken(known.poses, 0.02)), rho
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_equations_are_those_of_the_definition(seed: int) -> None:
+    matches, poses, rho = unlucky(seed)
+    load_library()
+    (found, found_scores), (expected, scores) = (
+        make(matches, poses, rho) for make in (equations_and_scores, equations_by_definition)
+    )
+    pairs = [(found_scores, scores)] + [
+        (getattr(found, name), getattr(expected, name))
+        for name in ("H", "gradient", "gain", "offset")
+    ]
+    for got, wanted in pairs:
+        np.testing.assert_allclose(got, wanted, rtol=1e-8, atol=1e-10 * np.abs(wanted).max())
+    errors = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
+    np.testing.assert_allclose(error_lengths(matches, poses, rho), errors, rtol=1e-9, atol=1e-14)
+
+
+def test_an_anchor_that_no_view_sees_pulls_no_pose() -> None:
+    matches, poses, rho = unlucky(0)
+    blind = replace(matches, used=np.zeros_like(matches.used))
+    part, scores = equations_and_scores(blind, poses, rho)
+    assert not part.H.any()
+    assert not part.gradient.any()
+    assert not scores.any()
+    assert np.isfinite(part.offset).all()
