@@ -12,6 +12,7 @@ import contextlib
 import logging
 import os
 import signal
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 from threading import Event
 from typing import Any, TypeVar
 
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.base.errors.failures import Failures
 
 T = TypeVar("T")
@@ -41,16 +43,57 @@ class _Asked:
     future: Future[Any]
 
 
+LONGEST_REST_S = 5.0
+"""Longest rest; a fit of the water works for longer, but is rare."""
+LOOK_S = 0.02
+"""Between two looks of who rests whether tracking is in time again."""
+
+
+class Lateness:
+    """How late tracking is, and how work beside it gives way to that: with few cores it competes
+    with tracking for Python's lock, the memory, and the core itself."""
+
+    def __init__(self, sleep: Callable[[float], object] = time.sleep) -> None:
+        self.times = 0.0
+        """The newest frame's lag, in multiples of the longest that is in time."""
+        self.rests = 0
+        """Pieces of work after which there was a rest."""
+        self._sleep = sleep
+
+    @property
+    def late(self) -> bool:
+        return self.times > 1.0
+
+    def rest(self, worked_s: float) -> None:
+        """After ``worked_s`` of work: rest ``times`` squared as long, if tracking is late, and no
+        longer than it is. On two cores at 40 % rests of ``times`` as long left it half a second
+        late for good (notes/2026-11-speed.md#small-computer)."""
+        if not self.late:
+            return
+        self.rests += 1
+        until = Deadline(min(worked_s * self.times**2, LONGEST_REST_S))
+        while self.late and not until.over:
+            self._sleep(LOOK_S)
+
+
 class Worker:
     """Does the work that one thread asks for; that thread takes the results too."""
 
-    def __init__(self, failures: Failures | None = None, threads: bool = False) -> None:
+    def __init__(
+        self,
+        failures: Failures | None = None,
+        threads: bool = False,
+        lateness: Lateness | None = None,
+    ) -> None:
         """Without ``threads`` a replay repeats bit for bit; with them no frame waits for work.
-        What raises is counted in ``failures``."""
+        What raises is counted in ``failures``; long work gives way to ``lateness``."""
         self._failures = failures or Failures()
+        self._lateness = lateness or Lateness()
         self._asking = ThreadPoolExecutor(1, "side work") if threads else None
         self._long = ThreadPoolExecutor(1, "long work")
         self._asked: deque[_Asked] = deque()
+        self._began_s = 0.0
+        """Of the newest long piece; written and read by its thread."""
 
     @property
     def in_step(self) -> bool:
@@ -75,7 +118,14 @@ class Worker:
     def start(self, work: Callable[[], T]) -> Future[T]:
         """Do a long piece of work, after the one before it; in a thread in every case, for a replay
         goes on until it needs the result."""
-        return self._long.submit(work)
+
+        def timed() -> T:
+            self._began_s = time.monotonic()
+            return work()
+
+        started = self._long.submit(timed)
+        self._long.submit(lambda: self._lateness.rest(time.monotonic() - self._began_s))
+        return started
 
     def take_finished(self, wait: bool = False) -> Iterator[WorkResult]:
         """What has been found of what was asked for, each once; with ``wait`` all of it."""
@@ -99,6 +149,7 @@ class Worker:
 
     def close(self) -> None:
         """End the threads; what they have not begun is left out, and so are all results."""
+        self._lateness.times = 0.0
         for threads in (self._asking, self._long):
             if threads is not None:
                 threads.shutdown(cancel_futures=True)

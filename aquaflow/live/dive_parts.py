@@ -14,7 +14,7 @@ from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Stages
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
-from aquaflow.base.worker import Worker, core_count
+from aquaflow.base.worker import Lateness, Worker, core_count
 from aquaflow.config import Config, parse_config
 from aquaflow.config.service import LimitsConfig
 from aquaflow.config.stage import MountingConfig
@@ -136,10 +136,11 @@ def assemble(
     # A dive whose map was made before mapping was switched off keeps it.
     mapped = config.mapping.enabled or _has_maps(choice.checkpoint)
     maps = make_maps(config, stages, folder.work, mapped, threads)
+    lateness = Lateness()
     thread = MapThread(
-        maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
-    )  # fmt: skip
-    worker = Worker(failures, threads=True)
+        maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level, lateness
+    )
+    worker = Worker(failures, threads=True, lateness=lateness)
     slam = Slam(config, stages, folder.work, worker, thread)
     slam.prior.warm_up()
     said = localise_in_base(slam, service.dive.site, choice.checkpoint)

@@ -127,7 +127,7 @@ class LiveDive:
         with contain("service counters"):
             parts.run.live = parts.loop.status()
         try:
-            notes = [*self.feed.notes, *([CUT_SHORT] if told() else [])]
+            notes = [*self.feed.notes, *parts.loop.notes(), *([CUT_SHORT] if told() else [])]
             finished = parts.run.finish(notes, progress, limits)
         except NotMappedError as error:
             log.warning("%s", error)

@@ -34,8 +34,8 @@ IDLE_S = 0.25
 BUSY_S = 0.01
 """The same while earlier frames wait for their poses: then one that was placed is taken."""
 LATE_MS = 150.0
-"""A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
-that found tracking idle is ready in 60 to 100 ms."""
+"""A frame that took longer from its arrival on is late, and work beside tracking gives way; at 10
+frames/s one that found tracking idle is ready in 60 to 100 ms."""
 PATIENCE_S = 2.0
 """Longest time without a frame before the state becomes WAITING."""
 LOST_AFTER = 3
@@ -106,8 +106,10 @@ class LiveLoop:
             self.dive_run.drop(frame)
         elif frame is not None:
             self._frame(frame)
-        elif self._past is not None:
-            self._catch_up(self._past)
+        else:
+            self.maps.lateness.times = 0.0
+            if self._past is not None:
+                self._catch_up(self._past)
         self._tend()
 
     def catch_up(self, until: Deadline) -> None:
@@ -118,6 +120,7 @@ class LiveLoop:
 
     def end(self) -> None:
         """After the last turn: telemetry of after the last frame is taken."""
+        self.maps.lateness.times = 0.0
         self.dive_run.samples(self.feed.latest_samples.take_new())
         self.heartbeats.retire(STAGE)
 
@@ -134,9 +137,22 @@ class LiveLoop:
             "mapped_without_steps": self.maps.without_steps,
             "mapping_failures": self.maps.failures,
             "mapping_waits": self.maps.waiting,
-            "mapping_rests": self.maps.rests,
+            "mapping_rests": self.maps.lateness.rests,
             "stage_failures": self.dive_run.slam.failures.to_json(),
         }
+
+    def notes(self) -> list[str]:
+        """What the dive lacks because the computer was too slow, in sentences."""
+        notes, slow_s, absent = [], self.counters.slow_s, self.maps.left_out
+        if slow_s > 0.0:
+            notes.append(
+                f"tracking was more than half a second behind the camera for {slow_s:.0f} s: the "
+                "computer is too slow for these settings"
+            )
+        if absent:
+            reasons = ", ".join(f"{count} for: {reason}" for reason, count in absent.items())
+            notes.append(f"{absent.total()} tracked frames are not in the map ({reasons})")
+        return notes
 
     # --- one frame ------------------------------------------------------------------------------
 
@@ -148,7 +164,7 @@ class LiveLoop:
             )
         else:
             self._track(frame)
-        self.maps.late = self.counters.frame(frame.arrival_ns) > LATE_MS
+        self.maps.lateness.times = self.counters.frame(frame.arrival_ns) / LATE_MS
 
     def _track(self, frame: Frame) -> None:
         try:
@@ -241,6 +257,7 @@ class LiveLoop:
             inconsistency(slam.tracker.monitor.trouble),
             [
                 *of_the_machine(self.degradation, self.pressure, self.config.limits),
+                *of_the_pace(self.counters),
                 *of_the_stages(self.maps, slam.failures),
                 *of_the_devices(devices),
             ],
@@ -278,6 +295,19 @@ def of_the_machine(
         full = f"disk full: {pressure.disk_free_mb:.0f} MB left"
         troubles.append(ServiceWarning(full, state.DISK_FULL))
     return troubles
+
+
+def of_the_pace(counters: Counters) -> list[ServiceWarning]:
+    """Warning of tracking that falls behind, whatever gives way to it."""
+    if not counters.slow:
+        return []
+    lag_s = 1e-3 * counters.recent_lag_ms
+    reason = (
+        f"tracking is {lag_s:.1f} s behind the camera and takes {counters.fps:.1f} "
+        "pictures a second: the computer is too slow for these settings; the preset small asks "
+        "for less"
+    )
+    return [ServiceWarning(reason, state.TOO_SLOW)]
 
 
 def of_the_stages(maps: MapThread, failures: Failures) -> list[ServiceWarning]:

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.worker import Lateness
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
@@ -45,8 +46,6 @@ STEPS_AT_ONCE = 4
 """Optimiser steps between two checks for a request in idle time: about 0.1 s at 480 px."""
 FEWER = 4
 """At the level FEWER_STEPS, one of this many steps is done."""
-LONGEST_REST_S = 1.0
-"""Longest rest; a fit of the water works for longer, but is rare."""
 JOIN_S = 30.0
 """Longest wait for the thread at the end of a dive."""
 BACKLOG_SHARE = 0.5
@@ -79,10 +78,8 @@ class MapThread:
         config: LiveMappingConfig,
         heartbeats: Heartbeats,
         level: Callable[[], DegradationLevel] = lambda: DegradationLevel.FULL,
-        rest: Callable[[float], object] | None = None,
+        lateness: Lateness | None = None,
     ) -> None:
-        """``rest``: sleeps for some seconds; by default ``refine`` and ``close`` wake the
-        thread."""
         self.left_out: Counter[str] = Counter()
         """Frames that the map never saw, by reason."""
         self.without_steps = 0
@@ -92,10 +89,8 @@ class MapThread:
         self.last_failure = ""
         self.failing = False
         """The last request raised, or found the GPU's memory full."""
-        self.late = False
-        """Set by tracking that is late: the thread then rests as long as it worked."""
-        self.rests = 0
-        """Requests after which the thread rested."""
+        self.lateness = lateness or Lateness()
+        """Of tracking, to which the thread gives way after each request."""
         self._maps, self._config, self._heartbeats, self._level = maps, config, heartbeats, level
         self._jobs: deque[tuple[str, Job]] = deque()
         self._growing = 0
@@ -106,7 +101,6 @@ class MapThread:
         self._ending = threading.Event()
         self._until = Deadline()
         """When frames that wait for mapping are left out, at the end of a dive."""
-        self._rest = rest or self._ending.wait
         self._given_back_at = DegradationLevel.FULL
         """The level at the last look; memory is given back at each step down."""
         self._thread = threading.Thread(target=self._run, name=STAGE, daemon=True)
@@ -234,7 +228,8 @@ class MapThread:
                 return
             began_s = time.monotonic()
             self._do(*job or ("optimise", self._optimise))
-            self._rest_if_late(time.monotonic() - began_s)
+            if not self._ending.is_set():
+                self.lateness.rest(time.monotonic() - began_s)
 
     def _give_back_memory(self) -> None:
         level, before = self._level(), self._given_back_at
@@ -242,13 +237,6 @@ class MapThread:
         if level > before:
             with self._maps.failures.contain("giving memory back"):
                 self._maps.give_back_memory()
-
-    def _rest_if_late(self, worked_s: float) -> None:
-        """Rest while tracking is late. With few cores, mapping competes with tracking for Python's
-        lock, the memory, and on a busy machine the core itself."""
-        if self.late and not self._ending.is_set():
-            self.rests += 1
-            self._rest(min(worked_s, LONGEST_REST_S))
 
     def _next(self) -> tuple[str, Job] | None:
         """The next request; None at once if a map can be optimised meanwhile."""
@@ -274,8 +262,10 @@ class MapThread:
             self.failures, self.failing = self.failures + 1, True
 
     def _wanting(self) -> Mapper | None:
-        """The map to optimise in idle time, if it still needs steps."""
+        """The map to optimise in idle time, if it still needs steps and tracking is in time."""
         if self._newest is None or self._level() is not DegradationLevel.FULL:
+            return None
+        if self.lateness.late:
             return None
         mapper = self._maps.mappers.get(self._newest)
         if mapper is None or len(mapper.gaussians) == 0:

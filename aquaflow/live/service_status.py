@@ -46,6 +46,9 @@ LAGS = 600
 """Frames whose lag is remembered: a minute at ten a second."""
 WINDOW_S = 5.0
 """Window of the rates and shares."""
+SLOW_MS = 500.0
+"""Median lag of the last seconds beyond which the pilot is told; tracking then takes two pictures a
+second, between which a vehicle swims a third of a picture at 0.5 m/s and 1.6 m altitude."""
 AROUND = frozenset({"refine"})
 """Stages that are not part of the loop."""
 
@@ -61,6 +64,10 @@ class Counters:
         self.classes: Counter[str] = Counter()
         """Frames by class."""
         self.fps = 0.0
+        self.recent_lag_ms = 0.0
+        """Median of the frames of the last window."""
+        self.slow_s = 0.0
+        """Of the windows in which that was more than ``SLOW_MS``."""
         self.slowest = ""
         """The stage with the most time in the last window."""
         self.shares: dict[str, float] = {}
@@ -87,17 +94,29 @@ class Counters:
             name: current[name] - totals.get(name, 0.0) for name in current if name not in AROUND
         }
         self.fps = (self.frames - frames) / (now - since)
+        recent = list(self._lags_ms)[max(frames - self.frames, -LAGS) :]
+        self.recent_lag_ms = float(np.median(recent)) if self.frames > frames else 0.0
+        self.slow_s += now - since if self.slow else 0.0
         self.shares = {name: 1e-3 * ms / (now - since) for name, ms in spent.items() if ms > 0.0}
         self.slowest = max(self.shares, key=lambda name: self.shares[name], default="")
         self._window = (now, self.frames, current)
 
+    @property
+    def slow(self) -> bool:
+        """True while tracking falls behind, whatever gives way to it."""
+        return self.recent_lag_ms > SLOW_MS
+
     def lag_ms(self) -> dict[str, float | None]:
-        """From a frame's arrival to its pose: median and 95th percentile of the last minute."""
+        """From a frame's arrival to its pose: median, 95th percentile and longest of the last
+        ``LAGS`` frames."""
         lags = list(self._lags_ms)
         if not lags:
-            return {"p50": None, "p95": None}
-        half, most = np.percentile(lags, (50, 95))
-        return {"p50": round(float(half), 1), "p95": round(float(most), 1)}
+            return dict.fromkeys(("p50", "p95", "max"))
+        values = np.percentile(lags, (50, 95, 100))
+        return {
+            name: round(float(value), 1)
+            for name, value in zip(("p50", "p95", "max"), values, strict=True)
+        }
 
     def to_json(self) -> dict[str, Any]:
         """For /health: counts, frames per second, times in ms."""

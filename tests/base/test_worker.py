@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from threading import Event
@@ -9,7 +10,7 @@ from threading import Event
 import pytest
 
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.worker import Worker
+from aquaflow.base.worker import Lateness, Worker
 
 GIVE_UP_S = 60.0
 
@@ -121,3 +122,18 @@ def test_closing_drops_what_was_not_taken_and_ends_the_threads() -> None:
     assert not worker.waiting()
     with pytest.raises(RuntimeError, match="shutdown"):
         worker.start(print)
+
+
+def test_long_work_gives_way_to_late_tracking_after_its_result_is_there() -> None:
+    slept, lateness = Event(), Lateness(lambda _: slept.wait(GIVE_UP_S))
+    worker = Worker(threads=True, lateness=lateness)
+    lateness.times = 1e6
+    assert worker.start(lambda: "late").result(GIVE_UP_S) == "late"
+    after = worker.start(lambda: "after the rest")
+    with pytest.raises(concurrent.futures.TimeoutError):
+        after.result(0.2)
+    lateness.times = 0.0
+    slept.set()
+    assert after.result(GIVE_UP_S) == "after the rest"
+    assert lateness.rests == 1
+    worker.close()

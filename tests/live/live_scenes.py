@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -72,7 +73,8 @@ class Clock:
 
 def frame_of(index: int) -> Frame:
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    return Frame(index, index * 100_000_000, 0, image, guess_camera(WIDTH, HEIGHT))
+    arrival_ns = time.monotonic_ns()
+    return Frame(index, index * 100_000_000, arrival_ns, image, guess_camera(WIDTH, HEIGHT))
 
 
 class ToldFeed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.state import ServiceState
+from aquaflow.live.service_status import WINDOW_S
 from aquaflow.tracking.consistency import SHOWN_FRAMES, Cause, InconsistentKeyframe
 from aquaflow.types import Dropped
 from tests.live.live_scenes import CALM, Told, frame_of, rows_of, visited
@@ -70,6 +72,28 @@ def test_a_silent_link_degrades_with_its_name_and_comes_back(told: Told) -> None
     link["state"] = "connected"
     told.frames("p", first=5)
     assert told.loop.health.state is ServiceState.TRACKING
+
+
+def test_tracking_that_falls_behind_is_said_and_noted_and_ends(told: Told) -> None:
+    late = replace(frame_of(0), arrival_ns=time.monotonic_ns() - 900_000_000)
+    for _ in range(2):
+        told.clock.pass_(WINDOW_S)
+        told.loop.take(late)
+    assert told.loop.health.state is ServiceState.DEGRADED
+    assert "too slow" in told.loop.health.reason
+    assert "0.9 s behind" in told.loop.health.reason
+    assert told.maps.lateness.times > 5.0
+    told.frames("p" * 3, first=5, every_s=WINDOW_S)
+    assert told.loop.health.state is ServiceState.TRACKING
+    assert told.maps.lateness.times < 1.0
+    assert f"for {2 * WINDOW_S:.0f} s" in told.loop.notes()[0]
+
+
+def test_frames_that_the_map_lacks_are_noted(told: Told) -> None:
+    assert told.loop.notes() == []
+    told.maps.left_out["mapping frame, mapping was behind"] = 3
+    (note,) = told.loop.notes()
+    assert "3 tracked frames are not in the map" in note
 
 
 def test_a_finding_of_the_monitor_is_a_state_with_its_reason_and_ends(told: Told) -> None:

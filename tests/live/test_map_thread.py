@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.worker import Lateness
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
-from aquaflow.live.map_thread import LONGEST_REST_S, STAGE, MapThread
+from aquaflow.live.map_thread import STAGE, MapThread
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.render.views import View
@@ -29,10 +30,10 @@ class Beside:
 
     def __init__(self) -> None:
         self.maps, self.heartbeats, self.level = RecordedMaps(), Heartbeats(), DegradationLevel.FULL
-        self.rested_s: list[float] = []
+        self.lateness = Lateness()
         config = LiveMappingConfig(backlog=2, nice=0)
         self.thread = MapThread(
-            self.maps, config, self.heartbeats, lambda: self.level, self.rested_s.append
+            self.maps, config, self.heartbeats, lambda: self.level, self.lateness
         )
 
     def hold(self) -> threading.Event:
@@ -159,19 +160,31 @@ def test_idle_steps_go_on_until_the_views_that_are_kept_have_had_theirs(
     assert mapper.views[-1].looks == 3 * LiveMappingConfig().steps_per_view
 
 
-def test_mapping_rests_as_long_as_it_worked_while_tracking_is_late(beside: Beside) -> None:
+def test_idle_steps_wait_until_tracking_is_in_time(
+    beside: Beside, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Mapper, "optimise", StubMapper.optimise)
+    mapper = StubMapper([growth(index).view for index in range(3)])
+    beside.maps.mappers[0] = mapper  # type: ignore[assignment]
+    beside.lateness.times = 1.5
+    beside.thread.grow(growth(9))
+    assert not mapper.done.wait(0.5)
+    beside.lateness.times = 0.5
+    assert mapper.done.wait(20.0)
+
+
+def test_mapping_rests_while_tracking_is_late_and_goes_on_once_it_is_not(beside: Beside) -> None:
+    beside.hold().set()
+    beside.hold().set()
+    assert beside.lateness.rests == 0
+    beside.lateness.times = 1e6
     beside.hold().set()
     done = threading.Event()
     beside.thread.inspect("see", lambda maps, lacking: done.set())
+    assert not done.wait(0.3)
+    beside.lateness.times = 1.0
     assert done.wait(20.0)
-    assert beside.rested_s == []
-    beside.thread.late = True
-    held = beside.hold()
-    assert not held.wait(0.05)  # what it works
-    held.set()
-    beside.hold().set()  # behind the rest
-    assert 0.04 < max(beside.rested_s) <= LONGEST_REST_S
-    assert beside.thread.rests >= 1
+    assert beside.lateness.rests >= 1
 
 
 def test_a_refinement_that_fails_leaves_the_map_as_it_is(

@@ -98,16 +98,24 @@ class PressureReader:
         return None if free is None or total <= 0 else free / total
 
     def _of_unit(self) -> float | None:
-        """Of what systemd's MemoryMax allows; the kernel kills the unit beyond that."""
+        """Of what systemd's MemoryMax or a container's limit allows; the kernel kills the unit
+        beyond that."""
         try:
-            group = (self._root / "proc/self/cgroup").read_text().rpartition("::")[2].strip()
-            folder = self._root / "sys/fs/cgroup" / group.lstrip("/")
-            limit = int((folder / "memory.max").read_text())
-            used = int((folder / "memory.current").read_text())
-            cached = _inactive_file((folder / "memory.stat").read_text())
-        except (OSError, ValueError):
-            return None  # no limit ("max"), or no control groups of version 2
-        return max(limit - used + cached, 0) / limit if limit > 0 else None
+            lines = (self._root / "proc/self/cgroup").read_text().splitlines()
+        except OSError:
+            return None
+        groups = [line.split(":", 2) for line in lines if line.count(":") >= 2]
+        mounted = self._root / "sys/fs/cgroup"
+        shares = [
+            share
+            for _, kinds, group in groups
+            for files in (UNIFIED, OLDER)
+            if kinds == files.kinds
+            # A container of version 1 is told its group as the machine has it, and sees the root.
+            for folder in (mounted / kinds / group.lstrip("/"), mounted / kinds)
+            if (share := _free_share(folder, files)) is not None
+        ]
+        return min(shares, default=None)
 
     def _disk_free_mb(self) -> float | None:
         try:
@@ -129,10 +137,32 @@ def _degrees(zone: Path) -> float | None:
     return value if value < HOTTEST_C else None
 
 
-def _inactive_file(stat: str) -> int:
-    """Bytes of the page cache that the kernel reclaims first."""
-    for line in stat.splitlines():
-        name, _, value = line.partition(" ")
-        if name == "inactive_file":
-            return int(value)
-    return 0
+class GroupFiles(NamedTuple):
+    """Names of a version of the kernel's control groups."""
+
+    kinds: str
+    """In /proc/self/cgroup, and of the folder."""
+    limit: str
+    used: str
+    cached: str
+    """In memory.stat: bytes of the page cache that the kernel reclaims first."""
+
+
+UNIFIED = GroupFiles("", "memory.max", "memory.current", "inactive_file")
+OLDER = GroupFiles(
+    "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+)
+"""Version 1, as on JetPack 5; without a limit it states one of 8 EiB."""
+
+
+def _free_share(group: Path, files: GroupFiles) -> float | None:
+    """Of a group's memory; None without a limit, and of a group that is not there."""
+    try:
+        limit = int((group / files.limit).read_text())
+        used = int((group / files.used).read_text())
+        stat = (group / "memory.stat").read_text()
+    except (OSError, ValueError):
+        return None
+    values = dict(line.split(" ", 1) for line in stat.splitlines() if " " in line)
+    cached = int(values.get(files.cached, 0))
+    return max(limit - used + cached, 0) / limit if limit > 0 else None

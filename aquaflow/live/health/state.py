@@ -186,6 +186,7 @@ OF_LEVEL = {
     DegradationLevel.RECORDING_ONLY: "it only records",
 }
 """What the service still does."""
+TOO_SLOW = "AquaFlow: the computer is too slow."
 DISK_FULL = "AquaFlow: the disk is full, nothing is kept."
 MAPPING_FAILS = "AquaFlow: the map cannot grow, tracking goes on."
 STAGE_FAILS = "AquaFlow: a stage fails again and again."

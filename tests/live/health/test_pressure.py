@@ -37,6 +37,21 @@ def test_memory_is_that_of_the_machine_or_of_the_unit_whichever_is_shorter(
     assert write(tmp_path, unlimited)().free_memory_share == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize(
+    "folder", ["sys/fs/cgroup/memory/docker/0a1b", "sys/fs/cgroup/memory"]
+)  # as the machine sees it, and as the container does
+def test_the_limit_of_an_older_control_group_counts_too(tmp_path: Path, folder: str) -> None:
+    limited = {
+        "proc/self/cgroup": "4:memory:/docker/0a1b\n1:cpu,cpuacct:/docker/0a1b\n0::/\n",
+        f"{folder}/memory.limit_in_bytes": "1000\n",
+        f"{folder}/memory.usage_in_bytes": "950\n",
+        f"{folder}/memory.stat": "cache 70\ninactive_file 1\ntotal_inactive_file 20\n",
+    }
+    assert write(tmp_path, limited)().free_memory_share == pytest.approx(0.07)
+    unlimited = {f"{folder}/memory.limit_in_bytes": "9223372036854771712\n"}
+    assert write(tmp_path, unlimited)().free_memory_share == pytest.approx(1.0)
+
+
 def test_the_hottest_zone_counts_and_zones_that_are_not_wired_up_do_not(tmp_path: Path) -> None:
     zones = {"0": "45000\n", "1": "93500\n", "2": "-256000\n", "3": "655350\n", "4": "broken"}
     files = {f"sys/class/thermal/thermal_zone{n}/temp": text for n, text in zones.items()}
