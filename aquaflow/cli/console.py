@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperGroup
@@ -76,15 +76,19 @@ def duration(value: float | None) -> float | None:
     return value
 
 
-def one_of(choices: Sequence[str], value: str, option: str) -> str:
+Choice = TypeVar("Choice", bound=str)
+
+
+def one_of(choices: Sequence[Choice], value: str, option: str) -> Choice:
     """The value of an option that has to be one of ``choices``.
 
     Raises:
         ArgumentError: it is another.
     """
-    if value not in choices:
-        raise ArgumentError(f"{option} is {value!r}; use one of {', '.join(choices)}")
-    return value
+    for choice in choices:
+        if choice == value:
+            return choice
+    raise ArgumentError(f"{option} is {value!r}; use one of {', '.join(choices)}")
 
 
 Seconds = Annotated[float | None, typer.Option(callback=duration, help="Stop after this long.")]

@@ -174,10 +174,9 @@ class Tiles:
         """Keyframes whose waiting tile reaches into ``sphere``, in their order."""
         if not self.waiting:
             return []
-        keyframes = np.array(sorted(self.waiting))
-        spheres = [self.waiting[number].sphere for number in keyframes.tolist()]
-        apart = _distances(spheres, sphere)
-        return keyframes[apart < 0.0].tolist()
+        keyframes = sorted(self.waiting)
+        apart = _distances([self.waiting[number].sphere for number in keyframes], sphere)
+        return [keyframe for keyframe, gap in zip(keyframes, apart, strict=True) if gap < 0.0]
 
     def far(self, gaussians: GaussianMap, sphere: Sphere, least: int) -> list[int]:
         """Keyframes whose Gaussians may leave so that ``least`` of them do, the farthest from
@@ -258,7 +257,7 @@ class Tiles:
         if not self.waiting:
             return set(self.seen)
         tiles = [tile.sphere for tile in self.waiting.values()]
-        apart, which = KDTree([tile.centre for tile in tiles]).query(
+        apart, which = KDTree(np.stack([tile.centre for tile in tiles])).query(
             [sphere.centre for sphere in self.seen.values()]
         )
         radii = np.array([tile.radius for tile in tiles])[which]

@@ -85,8 +85,8 @@ class Tools:
         return measure(str(given.get("what")), asked, scene)
 
     def _shown(self, given: Asked) -> ViewerSplats:
-        """The Gaussians that a browser shows, by what it says of them: with ``all`` those that float
-        too."""
+        """The Gaussians that a browser shows, by what it says of them: with ``all`` those that
+        float too."""
         shown = None if self.exhibit is None else self.exhibit.map
         if shown is None:
             raise InputError("there is no map yet to point at; wait for it")

@@ -166,14 +166,17 @@ class WorldFrames:
         count, before = len(snapshot.nodes), self._solved
         bases = [] if self.base is None else self.base.worlds(snapshot)
         lately = FEW_KEYFRAMES < count <= (1.0 + ASKED_AGAIN) * self._asked
+        make: Callable[[Snapshot], Straightened]
         if lately and before is not None and before.fits(snapshot):
             make = partial(straighten_again, before=before, bases=bases)
         else:
             survey, self._asked = self.survey(snapshot), count
             t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
 
-            def make(better: Snapshot) -> Straightened:
+            def ask(better: Snapshot) -> Straightened:
                 return straighten(better, replace(survey, nodes=better.nodes), t_s, bases)
+
+            make = ask
 
         def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
