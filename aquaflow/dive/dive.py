@@ -35,6 +35,7 @@ from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
+    from aquaflow.render.views import View
 
 FRAMES, METRICS, MAP = dive_status.FRAMES, dive_status.METRICS, dive_status.MAP
 TRAJECTORY = "trajectory.tum"
@@ -304,9 +305,24 @@ class Dive:
             from aquaflow.render import select_renderer
 
             renderer = select_renderer(self.config.mapping.renderer)
-            name = MAP if number == self.main else f"map_{number}.aqf"
-            self._maps[number] = read_map_file(self.file(name), renderer)
+            self._maps[number] = read_map_file(self._map_file(number), renderer)
         return self._maps[number]
+
+    def _map_file(self, sub_map: int) -> Path:
+        return self.file(MAP if sub_map == self.main else f"map_{sub_map}.aqf")
+
+    def views(self) -> Sequence[View]:
+        """The views that the largest sub-map was made from, without pictures; of its Gaussians
+        nothing is read.
+
+        Raises:
+            InputError: its map is missing or damaged.
+        """
+        if self.main in self.maps or self.main in self._maps:
+            return self.map().views
+        from aquaflow.dive.map_file import read_map_views  # loads torch
+
+        return read_map_views(self._map_file(self.main))
 
     def filled_map(self) -> Mapper:
         """As :meth:`map`, of the largest sub-map.

@@ -7,7 +7,8 @@ viewpoint; this file has the water, the light of every view and the decoder itse
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,18 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.base.errors import AquaFlowError, DamagedError, InputError, reason_of
-from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_facts_file
+from aquaflow.base.storage.archive import (
+    UNREADABLE,
+    Arrays,
+    read_facts_file,
+    write_facts_file,
+)
 from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.dive.results import WaterSummary
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import restored_gaussians
-from aquaflow.mapping.state import deserialise, serialise
+from aquaflow.mapping.state import VIEWS, Facts, deserialise, deserialise_views, serialise
 from aquaflow.render.contract import CPU, Renderer, radiance
 from aquaflow.render.transfers import map_out, picture_out, water_in, water_out
 from aquaflow.render.views import View
@@ -65,8 +71,26 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
     Raises:
         InputError: the file is not there, damaged, not an AquaFlow map, or of a newer AquaFlow.
     """
+    facts, arrays = _read(path)
+    with _naming(path):
+        return deserialise(facts, arrays, renderer)
+
+
+def read_map_views(path: Path) -> list[View]:
+    """The views of a map in its order, without pictures; nothing of its Gaussians is read.
+
+    Raises:
+        InputError: the file is not there, damaged, not an AquaFlow map, or of a newer AquaFlow.
+    """
+    facts, arrays = _read(path, only=VIEWS)
+    with _naming(path):
+        return deserialise_views(facts, arrays)
+
+
+def _read(path: Path, only: str = "") -> tuple[Facts, Arrays]:
+    """The facts of a map, and those of its arrays whose names begin with ``only``."""
     try:
-        facts, arrays = read_facts_file(path)
+        facts, arrays = read_facts_file(path, only=only)
         if facts["kind"] != KIND:
             raise DamagedError("it says that it is something else")
     except UNREADABLE as error:
@@ -76,8 +100,14 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
             f"the map {path} has format {facts['format']}, this AquaFlow reads format {FORMAT}; "
             "update AquaFlow"
         )
+    return facts, arrays
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Whatever damage raises is an InputError that names the file."""
     try:
-        return deserialise(facts, arrays, renderer)
+        yield
     except (KeyError, ValueError, TypeError, RuntimeError, IndexError, AquaFlowError) as error:
         raise InputError(_unreadable(path, error)) from error
 

@@ -8,9 +8,10 @@ wxyz, colour as the zeroth spherical harmonic.
 from __future__ import annotations
 
 import os
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,9 @@ PROPERTIES = (
 OPACITY_MARGIN = 1e-6
 """Opacities are kept this far from 0 and 1, where the logit is infinite."""
 
+CHUNK = 1 << 18
+"""Gaussians that are encoded at a time: 60 MB."""
+
 HEADER_LIMIT = 64 * 1024
 """Bytes within which a header must end; the 3DGS header with all harmonics has 1.5 kB."""
 
@@ -48,6 +52,10 @@ PLY_TYPES = {
     **dict.fromkeys(("uint", "uint32"), "<u4"),
 }
 """Names of PLY number types and the numpy types that they are."""
+
+
+Which: TypeAlias = slice | npt.NDArray[np.bool_] | npt.NDArray[np.integer[Any]]
+"""Some of N Gaussians: [N] True for those, or [M] their numbers."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +73,13 @@ class PlyGaussians:
     colours: Array
     """[N, 3] RGB, usually in [0, 1]."""
 
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self.means)
+
     def rows(
         self,
-        which: slice | npt.NDArray[np.bool_],  # [N] bool
+        which: Which,
     ) -> PlyGaussians:
         """Some of the Gaussians."""
         return PlyGaussians(
@@ -97,15 +109,19 @@ def write_ply(path: Path, splats: PlyGaussians) -> int:
     Raises:
         InputError: the file cannot be written.
     """
-    table = _encode(splats)
-    finite = np.isfinite(table).all(axis=1)
-    rows = np.ascontiguousarray(table[finite], dtype="<f4")
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    parts = []
+    for first in range(0, len(splats), CHUNK):
+        table = _encode(splats.rows(slice(first, first + CHUNK)))
+        finite = np.isfinite(table).all(axis=1)
+        parts.append(np.ascontiguousarray(table[finite], dtype="<f4"))
+    count = sum(map(len, parts))
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in PROPERTIES]
     with atomic_write(path) as stream:
         stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-        stream.write(rows.tobytes())
-    return int(len(table) - len(rows))
+        for rows in parts:
+            stream.write(rows.data)
+    return len(splats) - count
 
 
 def _encode(splats: PlyGaussians) -> npt.NDArray[np.float32]:
@@ -125,40 +141,69 @@ def _encode(splats: PlyGaussians) -> npt.NDArray[np.float32]:
         return np.concatenate(columns, axis=1).astype(np.float32)
 
 
+class PlyFile:
+    """The Gaussians of a 3DGS PLY, of which memory holds what was asked for; harmonics above the
+    zeroth are ignored."""
+
+    def __init__(self, path: Path) -> None:
+        """
+        Raises:
+            InputError: the file is not a binary 3DGS PLY or is cut off.
+        """
+        self._T: Sim3 | None = None
+        try:
+            with open_regular(path) as stream:
+                count, dtype = _read_header(stream, path)
+                start = stream.tell()
+                there = (os.fstat(stream.fileno()).st_size - start) // max(dtype.itemsize, 1)
+                if there < count:
+                    raise InputError(
+                        f"{path} is cut off: {there} of {count} Gaussians are there; copy or "
+                        "export it again"
+                    )
+                self._table: npt.NDArray[np.void] = np.zeros(0, dtype)
+                if count:
+                    self._table = np.memmap(stream, dtype, "r", start, (count,))
+        except OSError as error:
+            raise InputError(
+                f"cannot read the map {path}: {error.strerror}; give a PLY file"
+            ) from error
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self._table)
+
+    def transform(self, T: Sim3) -> PlyFile:
+        """The same Gaussians in the frame that ``T`` maps to."""
+        moved = copy(self)
+        moved._T = T if self._T is None else T @ self._T
+        return moved
+
+    def rows(self, which: Which) -> PlyGaussians:
+        """Some of the Gaussians."""
+        table = self._table[which]
+
+        def columns(*names: str) -> npt.NDArray[np.float32]:
+            return np.stack([table[name].astype(np.float32) for name in names], axis=-1)
+
+        logit = columns("opacity")[:, 0].astype(np.float64)
+        found = PlyGaussians(
+            means=columns("x", "y", "z"),
+            wxyz=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
+            opacities=(0.5 * (1.0 + np.tanh(0.5 * logit))).astype(np.float32),
+            colours=columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_C0) + np.float32(0.5),
+        )
+        return found if self._T is None else found.transform(self._T)
+
+
 def read_ply(path: Path) -> PlyGaussians:
-    """Read a 3DGS PLY; harmonics above the zeroth are ignored.
+    """All Gaussians of a :class:`PlyFile`.
 
     Raises:
         InputError: the file is not a binary 3DGS PLY or is cut off.
     """
-    try:
-        with open_regular(path) as stream:
-            count, dtype = _read_header(stream, path)
-            there = os.fstat(stream.fileno()).st_size - stream.tell()
-            # A header may claim any number, for which memory would be made.
-            body = stream.read(min(count * dtype.itemsize, there))
-    except OSError as error:
-        raise InputError(
-            f"cannot read the map {path}: {error.strerror}; give a PLY file"
-        ) from error
-    if len(body) < count * dtype.itemsize:
-        raise InputError(
-            f"{path} is cut off: {len(body) // dtype.itemsize} of {count} Gaussians are there; "
-            "copy or export it again"
-        )
-    table = np.frombuffer(body, dtype=dtype)
-
-    def columns(*names: str) -> npt.NDArray[np.float32]:
-        return np.stack([table[name].astype(np.float32) for name in names], axis=-1)
-
-    logit = columns("opacity")[:, 0].astype(np.float64)
-    return PlyGaussians(
-        means=columns("x", "y", "z"),
-        wxyz=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
-        opacities=(0.5 * (1.0 + np.tanh(0.5 * logit))).astype(np.float32),
-        colours=columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_C0) + np.float32(0.5),
-    )
+    return PlyFile(path).rows(slice(None))
 
 
 def _read_header(stream: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:

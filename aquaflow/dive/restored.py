@@ -265,7 +265,7 @@ def export_posed_pictures(
         ConfigError: the dive's settings cannot be read.
     """
     mapper = dive.map()
-    views, where = read_posed_views(dive, mapper)
+    views, where = read_posed_views(dive, mapper.views)
     exif = exif_of_views(dive, mapper.views)
     cloud = PointCloud(read_splats(dive, where, water=not restored), views, where)
     pictures = (

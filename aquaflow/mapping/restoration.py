@@ -23,6 +23,8 @@ from aquaflow.water.white_balance import Recovered
 
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""
+CHUNK = 1 << 18
+"""Gaussians whose colours are restored at a time: 150 MB."""
 RESTORED = 0.5
 """Confidence above which a pixel's colour is more the picture's than the scene's mean: open water
 and what is lost in it say nothing of how light a scene is."""
@@ -190,8 +192,25 @@ def seen_and_restored(
     water = mean_water(scene, views)
     if water is None:
         return radiance, Recovered(radiance, torch.ones_like(radiance[:, 0]))
-    centres = np.stack([view.T_wc.t for view in views])
-    nearest = KDTree(centres).query(map_out(scene.gaussians.means))[0]
-    z = water_in(np.asarray(nearest), radiance.device)
+    tree = KDTree(np.stack([view.T_wc.t for view in views]))
+    means = scene.gaussians.means
+    parts = [
+        _seen_and_restored(scene, radiance[part], means[part], tree, water)
+        for part in (slice(first, first + CHUNK) for first in range(0, max(1, len(means)), CHUNK))
+    ]
+    seen, pictures, confidences = (torch.cat(each) for each in zip(*parts, strict=True))
+    return seen, Recovered(pictures, confidences)
+
+
+def _seen_and_restored(
+    scene: Scene,
+    radiance: Tensor,  # [N, 3]
+    means: Tensor,  # [N, 3]
+    cameras: KDTree,
+    water: WaterParameters,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours as the nearest of ``cameras`` saw them, colours without water, and confidence."""
+    z = water_in(np.asarray(cameras.query(map_out(means))[0]), radiance.device)
     seen = radiance * water.transmission(z) + water.backscatter(z)
-    return seen, restored_radiance(scene, radiance, z, water)
+    recovered = restored_radiance(scene, radiance, z, water)
+    return seen, recovered.picture, recovered.confidence

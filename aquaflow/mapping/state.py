@@ -51,6 +51,8 @@ Facts = dict[str, Any]
 
 NO_PIXELS = np.zeros((0, 0, 3), np.uint8)
 """A view's picture is no part of the map."""
+VIEWS = "views."
+"""What the names of the views' arrays begin with."""
 GROUPS = ("group", "slot", "table", "fill", "voxel", "features")
 """Tables of the voxel groups, in the order of their names in the file."""
 
@@ -145,10 +147,7 @@ def deserialise(
             raw, restored = facts[name]
             setattr(scene, name, (float(raw), float(restored)))
     mapper.optimiser.steps, mapper.optimiser.undone = int(facts["steps"]), int(facts["undone"])
-    if len(facts["cameras"]) > len(arrays["views.numbers"]):
-        raise DamagedError("it has more cameras than views")
-    cameras = [to_camera(values) for values in facts["cameras"]]
-    mapper.views = _read_views(arrays, cameras, device)
+    mapper.views = deserialise_views(facts, arrays, device)
     mapper.optimiser.adam.extend(len(gaussians))
     mapper.optimiser.adam.bind(gaussians.parameters)
     if not facts["decoder"]:
@@ -185,9 +184,17 @@ def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
     return arrays
 
 
-def _read_views(
-    arrays: Mapping[str, Any], cameras: Sequence[CameraModel], device: torch.device
+def deserialise_views(
+    facts: Facts, arrays: Mapping[str, Any], device: torch.device = CPU
 ) -> list[View]:
+    """The views of a serialised map; of ``arrays`` those whose names begin with VIEWS are enough.
+
+    Raises:
+        KeyError, ValueError, TypeError, IndexError: these are no map's.
+    """
+    if len(facts["cameras"]) > len(arrays["views.numbers"]):
+        raise DamagedError("it has more cameras than views")
+    cameras = [to_camera(values) for values in facts["cameras"]]
     views = []
     rows = (arrays[f"views.{name}"] for name in ("numbers", "poses", "log_gains", "moments"))
     for i, (numbers, pose, log_gain, moments) in enumerate(zip(*rows, strict=True)):

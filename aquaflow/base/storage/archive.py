@@ -15,7 +15,7 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
@@ -114,9 +114,13 @@ def read_array_file(path: Path, most_bytes: int = MOST_ARRAY_BYTES) -> Array:  #
 
 
 def read_arrays_of(
-    path: Path, stored: bool = False, folders: int = 0, most_bytes: int | None = None
+    path: Path,
+    stored: bool = False,
+    folders: int = 0,
+    most_bytes: int | None = None,
+    wanted: Callable[[str], bool] = lambda _: True,
 ) -> dict[str, Array]:  # of any shape
-    """All arrays of a ``.npz``, by name.
+    """All arrays of a ``.npz``, by name; only those whose name is ``wanted``.
 
     Raises:
         UNREADABLE: one of them.
@@ -127,7 +131,7 @@ def read_arrays_of(
             raise DamagedError("two arrays have one name")
         if not all(name.endswith(".npy") for name in names):
             raise DamagedError("it holds something else than arrays")
-        return {name: read_array(archive, name) for name in (n[:-4] for n in names)}
+        return {name: read_array(archive, name) for name in (n[:-4] for n in names) if wanted(name)}
 
 
 def _refuse_long(archive: zipfile.ZipFile, name: str, most_bytes: int | None) -> zipfile.ZipInfo:
@@ -277,13 +281,16 @@ def write_facts_file(
         np.savez(stream, allow_pickle=False, **{FACTS: np.frombuffer(text, np.uint8)}, **arrays)
 
 
-def read_facts_file(path: Path, folders: int = 0) -> tuple[dict[str, Any], Arrays]:
-    """What was written; ``folders`` as for :func:`aquaflow.base.errors.regular_file.open_regular`.
+def read_facts_file(path: Path, folders: int = 0, only: str = "") -> tuple[dict[str, Any], Arrays]:
+    """What was written; ``folders`` as for :func:`aquaflow.base.errors.regular_file.open_regular`;
+    ``only``: what the names of the arrays that are read begin with.
 
     Raises:
         UNREADABLE: one of them, of :mod:`aquaflow.base.storage.archive`.
     """
-    arrays = read_arrays_of(path, stored=True, folders=folders)
+    arrays = read_arrays_of(
+        path, True, folders, wanted=lambda name: name == FACTS or name.startswith(only)
+    )
     text = arrays.pop(FACTS).tobytes()
     if len(text) > MOST_FACTS_BYTES:
         raise DamagedError("its facts are longer than a dive's can be")

@@ -19,13 +19,13 @@ import numpy.typing as npt
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement, placement
-from aquaflow.dive.ply import SH_C0, PlyGaussians
+from aquaflow.dive.ply import SH_C0, PlyFile, PlyGaussians
 from aquaflow.dive.point_cloud import CHUNK, read_splats
 from aquaflow.geometry.similarity import Sim3
 
 Array = npt.NDArray[np.floating]
 Bytes = npt.NDArray[np.uint8]
-Encode = Callable[[slice], Bytes]
+Encode = Callable[[PlyGaussians], Bytes]
 
 MAGIC, VERSION = 0x5053474E, 3
 RIGHT_UP_BACK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -54,24 +54,27 @@ def export_spz(dive: Dive, path: Path, water: bool = False) -> tuple[int, Placem
     turned = replace(where, T_un=Sim3(RIGHT_UP_BACK, np.zeros(3), 1.0) @ where.T_un)
     splats = read_splats(dive, turned, water)
     write_spz(path, splats)
-    return len(splats.means), where
+    return len(splats), where
 
 
-def write_spz(path: Path, splats: PlyGaussians) -> None:
+def write_spz(path: Path, splats: PlyGaussians | PlyFile) -> None:
     """Write Gaussians, whose axes are right, up, back.
 
     Raises:
         InputError: the file cannot be written.
     """
-    count, bits = len(splats.means), fraction_bits(splats.means)
+    count = len(splats)
+    parts = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
+    reach = max((_reach(splats.rows(part).means) for part in parts), default=0.0)
+    bits = fraction_bits(reach)
     encoders: tuple[Encode, ...] = (
-        lambda part: _positions(splats.means[part], bits),
-        lambda part: _bytes(255.0 * splats.opacities[part]),
+        lambda part: _positions(part.means, bits),
+        lambda part: _bytes(255.0 * part.opacities),
         lambda part: _bytes(
-            255.0 * (0.5 + COLOUR_SCALE * (splats.colours[part].astype(np.float64) - 0.5) / SH_C0)
+            255.0 * (0.5 + COLOUR_SCALE * (part.colours.astype(np.float64) - 0.5) / SH_C0)
         ),
-        lambda part: _bytes(LOG_SCALE_STEPS * (np.log(splats.scales[part]) - LEAST_LOG_SCALE)),
-        lambda part: smallest_three(splats.wxyz[part]),
+        lambda part: _bytes(LOG_SCALE_STEPS * (np.log(part.scales) - LEAST_LOG_SCALE)),
+        lambda part: smallest_three(part.wxyz),
     )
     with (
         atomic_write(path) as stream,
@@ -80,16 +83,20 @@ def write_spz(path: Path, splats: PlyGaussians) -> None:
         # Degree 0 of the harmonics, no flags, a reserved byte.
         packed.write(struct.pack("<3I4B", MAGIC, VERSION, count, 0, bits, 0, 0))
         for encode in encoders:
-            for first in range(0, count, CHUNK):
-                packed.write(encode(slice(first, first + CHUNK)).tobytes())
+            for part in parts:
+                packed.write(encode(splats.rows(part)).tobytes())
 
 
-def fraction_bits(
+def _reach(
     means: Array,  # [N, 3]
-) -> int:
-    """Bits behind the point with which every coordinate fits into 24."""
-    reach = max(float(np.abs(means).max(initial=0.0)), 1.0)
-    return max(0, min(MOST_FRACTION_BITS, int(np.log2(LARGEST_COORDINATE / reach))))
+) -> float:
+    """The largest coordinate, without its sign."""
+    return float(np.abs(means).max(initial=0.0))
+
+
+def fraction_bits(reach: float) -> int:
+    """Bits behind the point with which every coordinate up to ``reach`` fits into 24."""
+    return max(0, min(MOST_FRACTION_BITS, int(np.log2(LARGEST_COORDINATE / max(reach, 1.0)))))
 
 
 def _positions(

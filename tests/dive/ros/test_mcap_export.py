@@ -158,7 +158,7 @@ def test_messages_bear_the_dives_own_times_in_utc(messages: Messages, dive: Path
 
 
 def test_frames_compose_to_the_pose_of_each_picture(messages: Messages, dive: Path) -> None:
-    where = read_posed_views(Dive(dive), Dive(dive).map())[1]
+    where = read_posed_views(Dive(dive), Dive(dive).views())[1]
     trajectory = read_dive(dive).trajectory
     T_un = where.T_un.matrix
     found = list(camera_to_map(messages))
@@ -199,7 +199,7 @@ def test_a_point_of_the_cloud_lies_where_a_picture_shows_it(messages: Messages, 
     info = messages["/camera/camera_info"][0]
     poses = dict(camera_to_map(messages))
     T_om = np.linalg.inv(poses[stamp_ns(info.ros_msg.header)])
-    ours = read_posed_views(Dive(dive), Dive(dive).map())[0][0]
+    ours = read_posed_views(Dive(dive), Dive(dive).views())[0][0]
     places = np.stack([points["x"], points["y"], points["z"], np.ones(len(points))]).astype(float)
     in_camera = (T_om @ places)[:3]
     pixels = (np.array(info.ros_msg.k).reshape(3, 3) @ in_camera)[:2] / in_camera[2]

@@ -13,11 +13,19 @@ from pyproj import CRS, Geod, Transformer
 from typer.testing import CliRunner
 
 from aquaflow.base.errors import ArgumentError, InputError
+from aquaflow.base.storage import archive
 from aquaflow.cli import app
 from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.ply import read_ply
-from aquaflow.dive.point_cloud import nearest_cameras, read_point_cloud, read_posed_views
+from aquaflow.dive.ply import PlyFile, PlyGaussians, Which, read_ply
+from aquaflow.dive.point_cloud import (
+    PosedView,
+    nearest_cameras,
+    read_point_cloud,
+    read_posed_views,
+)
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.export.point_clouds import write_laz
 from tests.survey.export.small_dive import (
     ORIGIN,
@@ -86,7 +94,7 @@ def test_directions_turn_to_the_grid_as_positions_do(dive: Path) -> None:
 
 
 def test_sigma_is_the_spread_along_the_ray(dive: Path, tmp_path: Path) -> None:
-    views, _ = read_posed_views(Dive(dive), Dive(dive).map())
+    views, _ = read_posed_views(Dive(dive), Dive(dive).views())
     cloud = read_point_cloud(Dive(dive))
     points = next(cloud.chunks())
     rays = points.positions - nearest_cameras(points.positions, views)
@@ -117,6 +125,50 @@ def test_a_dive_in_map_units_says_so_and_has_no_grid(tmp_path: Path) -> None:
     assert np.abs(cloud.z).max() < 1.1
 
 
+def test_memory_holds_a_chunk_of_the_map_and_the_views_alone(
+    dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(point_cloud, "CHUNK", 97)
+    held: list[int] = []
+    arrays: list[str] = []
+    rows, read = PlyFile.rows, archive.read_array
+
+    def counted(file: PlyFile, which: Which) -> PlyGaussians:
+        found = rows(file, which)
+        held.append(len(found))
+        return found
+
+    def named(file: Any, name: str, most_bytes: int | None = None) -> Any:
+        arrays.append(name)
+        return read(file, name, most_bytes)
+
+    monkeypatch.setattr(PlyFile, "rows", counted)
+    monkeypatch.setattr(archive, "read_array", named)
+    assert len(written(dive, tmp_path / "a.laz").x) == 1200
+    assert max(held) == 97
+    assert "views.poses" in arrays
+    assert not any(name.startswith("gaussians.") for name in arrays)
+
+
+def test_each_point_has_the_nearest_camera_that_shows_it() -> None:
+    camera = CameraModel(64, 48, 80.0, 80.0, 32.0, 24.0)
+    rng = np.random.default_rng(0)
+    views = [
+        PosedView(k, camera, Sim3(so3_exp(rng.normal(0.0, 0.4, 3)), rng.uniform(-3.0, 3.0, 3)))
+        for k in range(60)
+    ]
+    points = rng.uniform((-4.0, -4.0, 0.0), (4.0, 4.0, 8.0), (400, 3))
+    found = nearest_cameras(points, views)
+    unseen = 0
+    for point, centre in zip(points, found, strict=True):
+        shows = [view for view in views if view.shows((point - view.T_uc.t) @ view.T_uc.R)]
+        unseen += not shows
+        among = np.array([view.T_uc.t for view in shows or views])
+        best = among[np.linalg.norm(among - point, axis=1).argmin()]
+        np.testing.assert_array_equal(centre, best)
+    assert 0 < unseen < 200
+
+
 def test_chunks_change_nothing(dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = written(dive, tmp_path / "a.laz")
     monkeypatch.setattr(point_cloud, "CHUNK", 97)
@@ -129,7 +181,7 @@ def test_chunks_change_nothing(dive: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_camera_that_does_not_see_a_point_is_taken_only_where_none_does(dive: Path) -> None:
-    views, _ = read_posed_views(Dive(dive), Dive(dive).map())
+    views, _ = read_posed_views(Dive(dive), Dive(dive).views())
     first = next(view for view in views if view.frame_index == 0)
     below = first.T_uc.apply(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]]))
     seen, unseen = nearest_cameras(below, [first])

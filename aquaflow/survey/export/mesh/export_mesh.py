@@ -109,7 +109,7 @@ def export_mesh(
     if targets.keys() != {"ply"}:
         load("xatlas", "a textured mesh", "survey")
     mapper, frame = dive.map(), dive.frame
-    posed, where = read_posed_views(dive, mapper)
+    posed, where = read_posed_views(dive, mapper.views)
     if len(mapper.gaussians) == 0:
         raise InputError(f"the map of {dive} is empty; map a recording that shows more")
     scale, report = frame.T_nm.scale, progress or _nothing
