@@ -121,6 +121,8 @@ class Deliverables:
     def summarise(self) -> None:
         """Poses as the map refined them, the vertical and the water of each sub-map."""
         attempt = self._attempt
+        for mapper in self.slam.mappers.values():
+            mapper.scene.finish()
         for sub_map in self.slam.mappers:
             attempt("the ground's plane", partial(self._find_ground, sub_map))
         refined = attempt("refined poses", lambda: refined_poses(self.slam, self.results))

@@ -306,6 +306,7 @@ class Dive:
 
             renderer = select_renderer(self.config.mapping.renderer)
             self._maps[number] = read_map_file(self._map_file(number), renderer)
+            self._maps[number].scene.finish()
         return self._maps[number]
 
     def _map_file(self, sub_map: int) -> Path:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,8 @@ MOST_VIEWS = 30
 """That are drawn, spread over the dive."""
 STRIDE_PX = 8
 """Between the pixels that are taken of a view."""
+CHUNK = 1 << 16
+"""Places that are looked up at a time; some 10 MB."""
 REACH = 3.0
 """Times the median range of a view up to which what it shows counts: what is farther is drawn from
 a ninth of the pixels."""
@@ -79,9 +82,18 @@ class ShownViews:
 
     def in_open_water(
         self,
-        places: Array,  # [N, 3] in the world of the sub-map
+        places: npt.NDArray[np.floating[Any]],  # [N, 3] in the world of the sub-map
     ) -> npt.NDArray[np.bool_]:
         """[N] True for places where more views show open water than a surface of the map."""
+        parts = range(0, len(places), CHUNK)
+        votes = [self._votes(places[first : first + CHUNK].astype(np.float64)) for first in parts]
+        return np.concatenate([np.zeros(0, np.int32), *votes]) > 0
+
+    def _votes(
+        self,
+        places: Array,  # [N, 3] in the world of the sub-map
+    ) -> npt.NDArray[np.int32]:
+        """[N] views that show open water there, less those that show a surface."""
         votes = np.zeros(len(places), np.int32)
         for view, z in zip(self._views, self._ranges, strict=True):
             local = (places - view.T_wc.t) @ view.T_wc.R
@@ -93,7 +105,7 @@ class ShownViews:
             ranges = np.linalg.norm(local[ahead], axis=1)
             votes[ahead[shown < 0.0]] += 1
             votes[ahead[np.abs(shown - ranges) <= AGREEING * ranges]] -= 1
-        return votes > 0
+        return votes
 
 
 def on_ground(frame: WorldFrame, mapper: Mapper) -> WorldFrame:

@@ -201,6 +201,7 @@ class Mapper:
         new: dict[str, Tensor],  # each [M, ...], of a GaussianMap
         view: View,
     ) -> int:
+        self.scene.go_on()
         count = len(new["means"])
         self.gaussians.extend(new, view.keyframe)
         self.optimiser.extend(count, view.centre())
@@ -292,6 +293,7 @@ class Mapper:
 
     def move(self, moves: Mapping[int, Sim3]) -> None:
         """Let Gaussians and views follow moved keyframes (see gaussians.py)."""
+        self.scene.go_on()
         moved = move_gaussians(self.gaussians, moves)
         if self.neural is not None:
             self.neural.move(moved)
@@ -310,6 +312,7 @@ class Mapper:
         The water stays this map's own: it is the same water, and is fitted again to all views. So
         does the decoder: what the other's says of its Gaussians, seen from its own views, is kept.
         """
+        self.scene.go_on()
         count, views = len(other.gaussians), in_time(dict.fromkeys([*self.views, *other.views]))
         # Only a decoder needs to know from where each is seen: cameras times Gaussians.
         centres = None if self.neural is None else other.scene.bake(other.views)
@@ -326,6 +329,7 @@ class Mapper:
 
     def optimise(self, steps: int) -> None:
         """Steps on the newest view now and then, else on any (paper, Sec. 3.4)."""
+        self.scene.go_on()
         if len(self.gaussians) == 0:
             return
         views = self.views if self._here is None else self._here
@@ -342,6 +346,7 @@ class Mapper:
     ) -> None:
         """The final refinement: all views in random order, rates falling, poses included; as much
         of it as there is time ``until`` then."""
+        self.scene.go_on()
         steps, until = self.config.optimiser.refine_steps, until or Deadline()
         if not (until.over or self.tiles.waiting):
             self.water_fitting.at_once(self.views)
@@ -416,6 +421,7 @@ class Mapper:
 
     def make_whole(self) -> None:
         """After a failure: every Gaussian is finite and has its row in the optimisers."""
+        self.scene.go_on()
         self.optimiser.make_whole()
 
     # --- looking ------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -10,13 +9,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.config import MediumConfig, SunlightConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.neural.neural import NeuralGaussians
+from aquaflow.mapping.spatial_index import SpatialIndex
 from aquaflow.render.contract import Renderer, activate
-from aquaflow.render.transfers import picture_out, pose_in, water_in, water_out, weights_in
+from aquaflow.render.transfers import (
+    map_out,
+    picture_out,
+    pose_in,
+    rows_in,
+    water_in,
+    water_out,
+    weights_in,
+)
 from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
 from aquaflow.water.exposure import gain_of, learn_gain
@@ -28,10 +39,6 @@ from aquaflow.water.open_sightings import light_of_ground, open_water
 from aquaflow.water.sightings import SOLID
 from aquaflow.water.sunlight import Sunlight
 from aquaflow.water.white_balance import Recovered, WhiteBalance
-
-MOST_DISTANCES = 1 << 22
-"""Between Gaussians and cameras at a time: 16 MB. Half a million Gaussians and 5,000 views at once
-would be 10 GB."""
 
 
 class Scene:
@@ -70,6 +77,9 @@ class Scene:
         """Of the same ground in the last fit, far over near, with the water and without; None where
         too little was seen from both."""
         self.gain_maps: dict[tuple[str, int, int], Tensor | None] = {}
+        self._finished = False
+        self._index: SpatialIndex | None = None
+        """Of a finished map; made when a view is first drawn."""
 
     def water(self, view: View) -> WaterParameters | None:
         """The medium for this view, or None while it is switched off."""
@@ -134,7 +144,7 @@ class Scene:
         """
         viewmat = view.viewmat() if viewmat is None else viewmat
         if parameters is None:
-            parameters = self.seen_from(view, viewmat)
+            parameters = self.in_sight(view, viewmat)
         water_learns = learn or self.medium.directional  # no fit finds what orientation does
         with torch.set_grad_enabled(water_learns and torch.is_grad_enabled()):
             water = self.water(view)
@@ -175,6 +185,40 @@ class Scene:
             return self.gaussians.parameters
         return self.neural.seen_from(view, viewmat)
 
+    def in_sight(
+        self,
+        view: View,
+        viewmat: Tensor,  # [4, 4] of ``view``
+    ) -> Mapping[str, Tensor]:
+        """As :meth:`seen_from`; of a finished map only those Gaussians that ``view`` may show, in
+        their order, which make the same picture."""
+        rows = None if self.neural is not None else self.near(view.camera, view.T_wc)
+        if rows is None:
+            return self.seen_from(view, viewmat)
+        return {
+            name: each.index_select(0, rows) for name, each in self.gaussians.parameters.items()
+        }
+
+    def near(self, camera: CameraModel, T_wc: Sim3) -> Tensor | None:
+        """[M] numbers, ascending, of the Gaussians that a picture from there may show; None for all
+        of them, as of a map that is not finished."""
+        if not self._finished:
+            return None
+        if self._index is None:
+            largest = self.gaussians.parameters["log_scales"].amax(dim=1).exp()
+            self._index = SpatialIndex(map_out(self.gaussians.means), map_out(largest))
+        rows = self._index.in_picture(camera, T_wc)
+        return None if len(rows) == len(self.gaussians) else rows_in(rows, self.device)
+
+    def finish(self) -> None:
+        """Nothing changes the Gaussians from here on, until :meth:`go_on`: so their places are
+        kept in an index."""
+        self._finished = True
+
+    def go_on(self) -> None:
+        """The Gaussians may change again."""
+        self._finished, self._index = False, None
+
     def bake_parameters(self, views: list[View]) -> Mapping[str, Tensor]:
         """The parameters as plain Gaussians, each as seen from the nearest of ``views``."""
         if self.neural is None or not views:
@@ -200,13 +244,13 @@ class Scene:
 
     def nearest_cameras(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
         """Place of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
-        centres = pose_in(np.stack([view.T_wc.t for view in views]), self.device)
-        means = self.gaussians.means
-        # Parts of one size: a product with a single row would be rounded otherwise.
-        parts = means.tensor_split(max(1, math.ceil(len(means) * len(views) / MOST_DISTANCES)))
-        nearest = [torch.cdist(part, centres).min(dim=1) for part in parts]
-        z, which = (torch.cat([each[k] for each in nearest]) for k in range(2))
-        return centres[which], z, which
+        centres = np.stack([view.T_wc.t for view in views])
+        z, which = KDTree(centres).query(map_out(self.gaussians.means))
+        found = (centres[which], z, which)
+        return (
+            pose_in(found[0], self.device), pose_in(found[1], self.device),
+            rows_in(np.asarray(found[2], np.int64), self.device),
+        )  # fmt: skip
 
     @contextmanager
     def learning_from(self, views: Sequence[View]) -> Iterator[None]:
@@ -323,7 +367,7 @@ class RenderedMap:
     z: Tensor
     """[H, W] range along the ray, map units; meaningless where alpha is near 0."""
     visible: Tensor
-    """[N] bool"""
+    """[N] bool, of the Gaussians that were drawn: of a finished map those near the view."""
     radius_px: Tensor
     """[N]"""
     active: Tensor | None = None

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,6 +39,18 @@ class _NativeGroup(ctypes.Structure):
         ("dim", ctypes.c_int32),
         ("learning_rate", ctypes.c_float),
     )
+
+
+def _with_zeros(
+    state: Tensor,  # [N, ...]
+    n_new: int,
+) -> Tensor:
+    """[N + n_new, ...] zeros at the end. Those of a whole map on the CPU take no memory until they
+    are written: a finished map that is read to be drawn never has a step."""
+    if len(state) or state.device.type != "cpu":
+        return torch.cat([state, state.new_zeros(n_new, *state.shape[1:])])
+    kind = np.dtype(str(state.dtype).removeprefix("torch."))
+    return torch.from_numpy(np.zeros((n_new, *state.shape[1:]), kind))
 
 
 class SelectiveAdam:
@@ -100,7 +113,7 @@ class SelectiveAdam:
 
     def extend(self, n_new: int) -> None:
         """Add state for ``n_new`` rows at the end, at step 0; then ``bind`` the grown tensors."""
-        self._replace(lambda state: torch.cat([state, state.new_zeros(n_new, *state.shape[1:])]))
+        self._replace(lambda state: _with_zeros(state, n_new))
 
     def extend_with(
         self,

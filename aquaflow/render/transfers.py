@@ -76,6 +76,14 @@ def groups_in(
     return _into("groups in", torch.tensor(numbers, dtype=torch.int64), device)
 
 
+def rows_in(
+    numbers: Array,  # [M] int64
+    device: torch.device,
+) -> Tensor:
+    """The Gaussians that a view of a finished map may show."""
+    return _into("rows in", torch.from_numpy(numbers), device)
+
+
 def water_in(
     values: Array | Sequence[float],  # [...]
     device: torch.device,

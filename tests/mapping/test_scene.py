@@ -11,7 +11,6 @@ import torch
 from aquaflow.config import MappingConfig, MediumConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping import scene as scene_module
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
@@ -256,27 +255,14 @@ def test_a_scene_without_water_has_no_balance_to_mend() -> None:
     assert dry.balance is None
 
 
-@pytest.mark.parametrize("most", [2, 7, 50])
-def test_nearest_cameras_are_the_same_bits_in_parts_as_at_once(
-    most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_nearest_camera_of_each_gaussian_is_found() -> None:
     ready, (first, *_) = submerged()
     places = np.random.default_rng(0).normal(size=(30, 3))
     views = [first.with_pixels(first.image, first.camera, None) for _ in places]
     for view, place in zip(views, places, strict=True):
         view.T_wc = Sim3(np.eye(3), place)
-    at_once = ready.nearest_cameras(views)
-    # Every part has two Gaussians at least.
-    monkeypatch.setattr(scene_module, "MOST_DISTANCES", 2 * most * len(views))
-    asked = []
-    cdist = torch.cdist
-
-    def counted(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        asked.append(len(a) * len(b))
-        return cdist(a, b)
-
-    monkeypatch.setattr(torch, "cdist", counted)
-    in_parts = ready.nearest_cameras(views)
-    assert all(torch.equal(a, b) for a, b in zip(at_once, in_parts, strict=True))
-    assert max(asked) <= 2 * most * len(views)
-    assert len(asked) > 1
+    centres, z, which = ready.nearest_cameras(views)
+    away = np.linalg.norm(ready.gaussians.means.double().numpy()[:, None] - places, axis=2)
+    np.testing.assert_array_equal(which.numpy(), away.argmin(axis=1))
+    np.testing.assert_allclose(z.numpy(), away.min(axis=1), rtol=1e-6)
+    np.testing.assert_allclose(centres.numpy(), places[which.numpy()], rtol=1e-6)

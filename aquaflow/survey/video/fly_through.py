@@ -100,11 +100,8 @@ class Clear:
         def to_device(values: npt.NDArray[np.floating]) -> torch.Tensor:  # [N, ...]
             return checkpoint_in(np.ascontiguousarray(values, np.float32), device)
 
-        self._means, self._wxyz, self._scales = map(
-            to_device, (splats.means, splats.wxyz, splats.scales)
-        )
-        self._opacities, self._colours = (
-            to_device(splats.opacities),
+        self._splats = (
+            *map(to_device, (splats.means, splats.wxyz, splats.scales, splats.opacities)),
             to_device(bounded[:, 0] / 255.0),
         )
 
@@ -113,8 +110,9 @@ class Clear:
         """[H, W, 3] from a pose."""
         camera, blank = self._camera, np.zeros((1, 1, 3), np.uint8)
         view = View(-1, blank, camera, T_wc, 0, False, device=self._mapper.device)
+        rows = self._mapper.scene.near(camera, T_wc)
         drawn = self._mapper.renderer(
-            self._means, self._wxyz, self._scales, self._opacities, self._colours,
+            *(each if rows is None else each.index_select(0, rows) for each in self._splats),
             view.viewmat(), view.K(), camera.width, camera.height,
         )  # fmt: skip
         return to_bytes(picture_out(drawn.image))

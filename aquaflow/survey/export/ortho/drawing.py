@@ -21,6 +21,7 @@ from aquaflow.dive.shown_views import ShownViews
 from aquaflow.mapping.appearance import shown_tone
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import mean_water, restored_radiance, to_bytes
+from aquaflow.mapping.spatial_index import SpatialIndex
 from aquaflow.render.contract import Renderer
 from aquaflow.render.limits import RADIUS_SIGMAS
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in, water_in
@@ -66,9 +67,11 @@ class GroundSplats:
         self._renderer: Renderer = mapper.renderer
         splats = splats_of(mapper)
         if mapper.medium.active:
-            splats = splats.rows(~shown.in_open_water(splats.means.astype(np.float64)))
+            splats = splats.rows(~shown.in_open_water(splats.means))
         self._splats = splats.transform(ground.T_gm)
-        self._reach = RADIUS_SIGMAS * self._splats.scales.max(axis=1, initial=0.0)
+        sigmas = self._splats.scales.max(axis=1, initial=0.0)
+        self._reach = RADIUS_SIGMAS * sigmas
+        self._index = SpatialIndex(self._splats.means, sigmas)
 
     @property
     def places(self) -> Array:
@@ -78,8 +81,9 @@ class GroundSplats:
     def reaching(self, grid: Grid, tile: GridTile) -> npt.NDArray[np.intp]:
         """[M] numbers of the Gaussians that touch a tile."""
         low, high = grid.bounds(tile)
-        places, reach = self._splats.means[:, :2], self._reach[:, None] + grid.pixel
-        return np.flatnonzero(((places > low - reach) & (places < high + reach)).all(axis=1))
+        near = self._index.in_box(low - grid.pixel, high + grid.pixel, RADIUS_SIGMAS)
+        places, reach = self._splats.means[near, :2], self._reach[near, None] + grid.pixel
+        return near[((places > low - reach) & (places < high + reach)).all(axis=1)]
 
     @torch.no_grad()
     def draw(
