@@ -124,6 +124,18 @@ def test_vertices_of_a_ply_have_colour_normal_and_sigma(written: dict[str, Path]
     assert "comment axes: x east, y north, z up; m\n" in header
 
 
+def test_a_dive_too_large_for_its_pictures_resolution_gets_a_coarser_mesh_that_says_so(
+    few_views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine = export_mesh(Dive(few_views), {"ply": tmp_path / "fine.ply"})
+    monkeypatch.setattr(export_module, "MOST_TRIANGLES", fine.triangles // 8)
+    coarse = export_mesh(Dive(few_views), {"ply": tmp_path / "coarse.ply"})
+    assert coarse.voxel > 1.5 * fine.voxel
+    assert coarse.triangles < fine.triangles / 3
+    asked = export_mesh(Dive(few_views), {"ply": tmp_path / "asked.ply"}, fine.voxel)
+    assert asked.triangles == fine.triangles
+
+
 def test_the_same_dive_gives_the_same_bytes(few_views: Path, tmp_path: Path) -> None:
     once, again = tmp_path / "once", tmp_path / "again"
     for folder in (once, again):

@@ -12,7 +12,7 @@ from aquaflow.render.library import library_or_none
 from aquaflow.survey.export.mesh import atlas as colouring
 from aquaflow.survey.export.mesh import blocks as blocks_module
 from aquaflow.survey.export.mesh.atlas import lay_out, look_at, paint, place_sigmas
-from aquaflow.survey.export.mesh.blocks import Blocks, truncation
+from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Blocks, truncation
 from aquaflow.survey.export.mesh.surface import DistanceSums, add_by_numpy, add_compiled
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from tests.survey.export.mesh_scenes import (
@@ -162,6 +162,25 @@ def test_compiled_fusion_finds_what_numpy_finds(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.near, expected.near)
     np.testing.assert_allclose(found.weights, expected.weights, rtol=1e-12)
     np.testing.assert_allclose(found.total, expected.total, rtol=1e-9, atol=1e-6)
+
+
+def test_a_chunk_has_its_blocks_and_those_in_the_layer_after_it(tmp_path: Path) -> None:
+    poses = around_sphere()
+    surfaces = surfaces_of(poses, [to_sphere] * len(poses), tmp_path, FAR_CAMERA)
+    blocks = Blocks(surfaces, VOXEL)
+    chunks, side = list(blocks.chunks()), CHUNK_BLOCKS * BLOCK
+    assert len(chunks) == blocks.chunk_count() >= 8
+    every = np.unique(np.concatenate([chunk.blocks for chunk in chunks]), axis=0)
+    assert len(every) == len(blocks)
+    for chunk in chunks:
+        near = ((every >= chunk.corner) & (every <= chunk.corner + side)).all(axis=1)
+        np.testing.assert_array_equal(chunk.blocks, every[near])
+
+
+def test_the_area_that_is_shown_is_known_to_a_factor_of_two(tmp_path: Path) -> None:
+    poses = around_sphere()
+    surfaces = surfaces_of(poses, [to_sphere] * len(poses), tmp_path, FAR_CAMERA)
+    assert 0.5 < surfaces.area / (4.0 * np.pi * RADIUS**2) < 2.0
 
 
 def test_too_many_voxels_are_refused_in_a_sentence(

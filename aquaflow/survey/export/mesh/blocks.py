@@ -78,9 +78,13 @@ class Blocks:
         Raises:
             InputError: there would be too many.
         """
-        keys = np.empty(0, np.int64)
-        for number in range(len(surfaces.views)):
-            keys = np.union1d(keys, _touch(surfaces, number, voxel))
+        keys, new = np.empty(0, np.int64), [np.empty(0, np.int64)]
+        last = len(surfaces.views) - 1
+        for number in range(last + 1):
+            new.append(_touch(surfaces, number, voxel))
+            # Joined when they are as many as those before: each view at once would be quadratic.
+            if number == last or sum(map(len, new)) > len(keys):
+                keys, new = np.unique(np.concatenate([keys, *new])), []
             if len(keys) > MOST_BLOCKS:
                 raise InputError(
                     f"voxels of {voxel:g} would be more than {MOST_BLOCKS * BLOCK**3 // 10**6} "
@@ -96,10 +100,26 @@ class Blocks:
 
     def chunks(self) -> Iterator[Chunk]:
         """Every chunk that holds a block, in a fixed order."""
+        chunks, blocks = self._members()
         for chunk in _unpack(np.unique(_pack(self._blocks // CHUNK_BLOCKS))):
-            first = chunk * CHUNK_BLOCKS
-            inside = (self._blocks >= first) & (self._blocks <= first + CHUNK_BLOCKS)
-            yield Chunk(first * BLOCK, self._blocks[inside.all(axis=1)] * BLOCK)
+            key = _pack(chunk[None])[0]
+            first, last = np.searchsorted(chunks, (key, key + 1))
+            corner = chunk * CHUNK_BLOCKS * BLOCK
+            yield Chunk(corner, self._blocks[blocks[first:last]] * BLOCK)
+
+    def _members(self) -> tuple[Integers, Integers]:
+        """Keys of chunks, ascending, and the numbers of the blocks that belong to each: those in it
+        and, in the layer after it, those of the chunks behind."""
+        own = self._blocks // CHUNK_BLOCKS
+        at_first = self._blocks % CHUNK_BLOCKS == 0
+        chunks, blocks = [], []
+        for back in np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3):
+            numbers = np.flatnonzero((at_first | (back == 0)).all(axis=1))
+            chunks.append(_pack(own[numbers] - back))
+            blocks.append(numbers)
+        keys, numbers = np.concatenate(chunks), np.concatenate(blocks)
+        order = np.lexsort((numbers, keys))
+        return keys[order], numbers[order]
 
     def chunk_count(self) -> int:
         """How many chunks there are."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -42,6 +43,9 @@ Progress = Callable[[str, int, int], None]
 
 VOXEL_PX = 2.0
 """Side of a voxel, in pixels of the mapped pictures at the median range."""
+MOST_TRIANGLES = 2_000_000
+"""About, where nobody asks for a resolution: half of a voxel's side squared each. The voxels of a
+longer dive are wider, or it would have tens of millions, which few programs open."""
 LEAST_VIEWS = 2
 """That show a place, or it is a hole: one view alone has no parallax. As in the ortho."""
 MOST_SIGMA_PX = 8.0
@@ -97,7 +101,7 @@ def export_mesh(
 
     Args:
         resolution: side of a voxel, m, or map units where the dive has no metres; None: two pixels
-            of the mapped pictures at their median range.
+            of the mapped pictures at their median range, wider from MOST_TRIANGLES on.
         water: with the water, as seen from the views' median range.
 
     Raises:
@@ -117,9 +121,7 @@ def export_mesh(
     views = ViewSurfaces(
         posed, drawn, next(iter(targets.values())).parent, partial(report, "views")
     )
-    surface = fused_surface(
-        views, resolution or round_to_digits(VOXEL_PX * views.footprint), report
-    )
+    surface = fused_surface(views, resolution or _usual_voxel(views), report)
     through = views.median_range if water and mapper.medium.active else None
     colours = Colours(mapper, scale, through)
 
@@ -149,6 +151,12 @@ def export_mesh(
         files, len(surface.mesh.vertices), len(surface.mesh.faces), surface.mesh.area(),
         surface.voxel, float(np.median(surface.sigma)), size, where, placed.origin, seen,
     )  # fmt: skip
+
+
+def _usual_voxel(views: ViewSurfaces) -> float:
+    """Side of a voxel where nobody asks for one."""
+    finest = VOXEL_PX * views.footprint
+    return round_to_digits(max(finest, math.sqrt(2.0 * views.area / MOST_TRIANGLES)))
 
 
 def _nothing(what: str, done: int, total: int) -> None:

@@ -40,6 +40,9 @@ SLOPE_PX = 3
 """Half the distance over which slopes of ranges are taken: over less, single Gaussians show."""
 RANGE, SIGMA, COSINE = range(3)
 """Layers that are kept of a view, of which NaN as range means none."""
+AREA_FOOTPRINTS = 32.0
+"""Side of the cells by which the area is known, in what pixels show across: wider than stride and
+relief leave holes."""
 LEAST_ALPHA = 1e-3
 """Divisor of colours where next to nothing is."""
 
@@ -123,12 +126,16 @@ class ViewSurfaces:
         """Range beyond which nothing becomes a surface: few pixels show much of it."""
         bounds = np.full((len(self.views), 2, 3), np.inf)
         bounds[:, 1] = -np.inf
+        side, cells = AREA_FOOTPRINTS * self.footprint, [np.empty((0, 3))]
         for number, view in enumerate(self.views):
             points = self.points(number, stride=4)[0]
             if len(points):
+                cells.append(np.unique(np.floor(points / side), axis=0))
                 points = np.vstack([points, view.T_uc.t])
                 bounds[number] = points.min(axis=0), points.max(axis=0)
         self._bounds = bounds
+        self.area = float(len(np.unique(np.concatenate(cells), axis=0)) * side**2)
+        """Of all that is shown, in the mesh's unit squared: to a factor of two."""
 
     def around(
         self,
@@ -214,7 +221,7 @@ def _spread(mapper: Mapper, view: View, middle: float) -> Array:
     """[H, W] standard deviation of the ranges within each pixel, map units. Ranges are drawn as
     differences from ``middle``, whose squares float32 holds."""
     viewmat, renderer = view.viewmat(), mapper.renderer
-    plain = mapper.scene.seen_from(view, viewmat)
+    plain = mapper.scene.in_sight(view, viewmat)
     drawn = activate(
         plain["means"], plain["log_scales"], plain["opacity_logits"], plain["raw_colours"],
         view.centre(), renderer.threads,
