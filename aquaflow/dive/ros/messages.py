@@ -24,6 +24,8 @@ JPEG_QUALITY = 90
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("sigma", "<f4")])
 """A point of the cloud; ``rgb`` holds the bytes 0, red, green, blue, high to low, and is declared
 as a float, as PCL, RViz and Foxglove expect it."""
+MOST_POINTS = 1 << 20
+"""Of a cloud in one message, 21 MB: what Foxglove turns without delay. LAZ and E57 have all."""
 HALF_PIXEL = 0.5
 """ROS's first pixel has its centre at (0, 0), AquaFlow's at (0.5, 0.5)."""
 OK, WARN = 0, 1
@@ -145,9 +147,22 @@ def camera_info(t_ns: int, frame_id: str, camera: CameraModel) -> Any:
 
 
 def packed_points(cloud: PointCloud) -> npt.NDArray[np.void]:
-    """[N] records of ``POINT``: all points of the cloud, in its frame and unit."""
-    packed = [point_records(c.positions, c.colours, c.sigma) for c in cloud.chunks()]
-    return np.concatenate([np.zeros(0, POINT), *packed])
+    """[N] records of ``POINT``, in the cloud's frame and unit: all of its points, or every n-th one
+    of more than MOST_POINTS."""
+    step, first, packed = points_step(cloud), 0, [np.zeros(0, POINT)]
+    for chunk in cloud.chunks():
+        chosen = slice(-first % step, None, step)
+        positions, colours, sigma = (
+            each[chosen] for each in (chunk.positions, chunk.colours, chunk.sigma)
+        )
+        packed.append(point_records(positions, colours, sigma))
+        first += len(chunk.positions)
+    return np.concatenate(packed)
+
+
+def points_step(cloud: PointCloud) -> int:
+    """Of how many points in a row :func:`packed_points` has one."""
+    return max(1, -(-len(cloud) // MOST_POINTS))
 
 
 def point_records(

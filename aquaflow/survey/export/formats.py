@@ -459,9 +459,12 @@ def _messages(job: _Job, path: Path, format: ExportFormat) -> tuple[str, dict[st
         f"pictures among them{_source(job)}; a layout for Foxglove to {wrote.layout}.\n"
         f"Frame map: {where.axes}; {where.unit}. Times: {wrote.times}."
     )
+    if wrote.points_step > 1:
+        said += f"\nOne of {wrote.points_step} points of the map; LAZ and E57 have all."
     return said, {
         "layout": str(wrote.layout), "messages": wrote.messages, "poses": wrote.poses,
-        "pictures": wrote.pictures, "unit": where.unit, "axes": where.axes, "times": wrote.times,
+        "pictures": wrote.pictures, "points_step": wrote.points_step, "unit": where.unit,
+        "axes": where.axes, "times": wrote.times,
     }  # fmt: skip
 
 

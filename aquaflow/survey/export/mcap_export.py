@@ -79,6 +79,8 @@ class McapExport:
     messages: int
     poses: int
     pictures: int
+    points_step: int
+    """Of how many points of the map in a row one is in the file."""
     times: str
     where: Placement
 
@@ -127,14 +129,14 @@ def export_mcap(
     with ros_file(path, _facts(source)) as file:
         seen = _Pictures(source, progress)
         first = source.at(source.frames[0])
-        _write_lasting(file, source, first)
+        step = _write_lasting(file, source, first)
         for frame in source.frames:
             _write_frame(file, source, frame)
             shown += seen.write(file, frame)
         count = file.count
         beside = path.with_suffix(".layout.json")  # first: where the messages are, all is
         write_json(beside, layout(*pictures(recording is not None, source.has_water)))
-    return McapExport(beside, count, len(source.posed), shown, source.times, source.where)
+    return McapExport(beside, count, len(source.posed), shown, step, source.times, source.where)
 
 
 def _facts(source: _Source) -> dict[str, str]:
@@ -148,13 +150,15 @@ def _facts(source: _Source) -> dict[str, str]:
     }
 
 
-def _write_lasting(file: RosFile, source: _Source, t_ns: int) -> None:
-    """What holds for the whole dive, at its beginning, so that it is seen from there on."""
+def _write_lasting(file: RosFile, source: _Source, t_ns: int) -> int:
+    """What holds for the whole dive, at its beginning, so that it is seen from there on; returns of
+    how many points in a row one was written."""
     tree, where = source.tree, source.where
     file.write(topics.TF_STATIC, t_ns, messages.transforms(t_ns, tree.fixed))
     poses = [(source.at(f), tree.moving(f.T_nc).T) for f in source.posed if f.T_nc is not None]
     file.write(topics.PATH, t_ns, messages.path(t_ns, MAP, poses))
-    points = messages.packed_points(read_point_cloud(source.dive))
+    cloud = read_point_cloud(source.dive)
+    points = messages.packed_points(cloud)
     file.write(topics.POINTS, t_ns, messages.point_cloud(t_ns, MAP, points))
     warnings = source.dive.metrics.get("warnings", [])
     level = messages.WARN if warnings else messages.OK
@@ -165,6 +169,7 @@ def _write_lasting(file: RosFile, source: _Source, t_ns: int) -> None:
         _water_status(source.dive.medium_facts),
     ]
     file.write(topics.DIAGNOSTICS, t_ns, messages.diagnostics(t_ns, statuses))
+    return messages.points_step(cloud)
 
 
 def _water_status(medium: dict[str, Any]) -> Any:

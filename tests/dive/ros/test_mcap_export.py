@@ -22,9 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.crash_report import MISUSED
+from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.dive.point_cloud import read_point_cloud, read_posed_views
 from aquaflow.dive.restored import restored_frames, tone_without_water
+from aquaflow.dive.ros import messages as ros_messages
 from aquaflow.dive.ros.topics import LASTING, TYPES
 from aquaflow.survey.export.mcap_export import export_mcap
 from aquaflow.water.mounting import Lamp
@@ -208,6 +210,17 @@ def test_a_point_of_the_cloud_lies_where_a_picture_shows_it(messages: Messages, 
     assert seen.sum() > 100
     # ROS's first pixel has its centre at zero, ours at a half.
     np.testing.assert_allclose(pixels.T[seen] + 0.5, expected[seen], atol=0.05)
+
+
+def test_of_more_points_than_a_message_takes_every_third_is_in_it(
+    dive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloud = read_point_cloud(Dive(dive))
+    whole = ros_messages.packed_points(cloud)
+    monkeypatch.setattr(ros_messages, "MOST_POINTS", len(whole) // 3 + 1)
+    monkeypatch.setattr(point_cloud, "CHUNK", 100)
+    assert ros_messages.points_step(cloud) == 3
+    np.testing.assert_array_equal(ros_messages.packed_points(cloud), whole[::3])
 
 
 def test_pictures_are_those_of_the_camera_the_map_and_the_restoration(
