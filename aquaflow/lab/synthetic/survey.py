@@ -173,12 +173,26 @@ class SurveyPictures:
         """[H, W] m along the optical axis, the truth of a frame."""
         return self._intersect_seabed(self.T_wc(index))[2]
 
-    def _picture(self, index: int) -> npt.NDArray[np.uint8]:
-        x, y, ahead, box = self._intersect_seabed(self.T_wc(index))
+    def seabed(
+        self,
+        x: Map,  # [H, W] m
+        y: Map,  # [H, W] m
+    ) -> tuple[Map, Map]:
+        """Depth [H, W] of the seabed below z = 0, m, and its clean radiance [H, W, 3]."""
+        box = float(x.min()), float(y.min()), float(x.max()), float(y.max())
+        depth = np.float32(ALTITUDE_M) + _sum(self._relief, x, y, box)
+        return depth, self._radiance(x, y, box)
+
+    def _radiance(self, x: Map, y: Map, box: Box) -> Map:
+        """[H, W, 3] of the seabed at ``x`` and ``y`` [H, W], m."""
         brightness = _sum(self._texture, x, y, box)
         tint = _sum(self._tint, x, y, box)
         log_colours = np.stack([brightness + tint, brightness, brightness - tint], axis=-1)
-        radiance = np.asarray(SAND, np.float32) * np.exp(log_colours)
+        return np.asarray(SAND, np.float32) * np.exp(log_colours)
+
+    def _picture(self, index: int) -> npt.NDArray[np.uint8]:
+        x, y, ahead, box = self._intersect_seabed(self.T_wc(index))
+        radiance = self._radiance(x, y, box)
         now = self.plan.conditions(index / FPS)
         water = replace(
             self._water,
