@@ -18,7 +18,7 @@ from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.dive.dive import FRAMES, HELD_OUT, TRAJECTORY, Dive
 from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation, rotation_from_quaternion
 from aquaflow.recordings.kept_pictures import kept_pictures
 from aquaflow.survey.viewer.moments import Float, moments
 from aquaflow.survey.viewer.viewer_content import POSE_NUMBERS
@@ -54,8 +54,10 @@ class DivePath:
     @property
     def rows(self) -> npt.NDArray[np.float32]:
         """[N, 8] as :meth:`aquaflow.survey.viewer.page.ViewerPage.show_path` takes them."""
-        rows = [[*T.t, *T.quaternion, q] for T, q in zip(self.poses, self.quality, strict=True)]
-        return np.array(rows, np.float32).reshape(-1, POSE_NUMBERS)
+        if not self.poses:
+            return np.zeros((0, POSE_NUMBERS), np.float32)
+        wxyz = quaternion_from_rotation(np.array([pose.R for pose in self.poses]))
+        return np.column_stack([self.places, wxyz, self.quality]).astype(np.float32)
 
     def thin(self, most: int = LONGEST_PATH) -> DivePath:
         """Every n-th pose, so that they are at most ``most``."""
@@ -92,7 +94,8 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
     if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 4:8], axis=1) == 0.0).any():
         raise InputError(f"{path} holds what is no pose; map the dive again")
-    poses = [Sim3(rotation_from_quaternion(np.roll(row[4:8], 1)), row[1:4]) for row in rows]
+    rotations = rotation_from_quaternion(rows[:, [7, 4, 5, 6]])
+    poses = [Sim3(R, t) for R, t in zip(rotations, rows[:, 1:4], strict=True)]
     return poses, rows[:, 0]
 
 

@@ -67,9 +67,9 @@ class FinishedDive:
     def summary(self) -> str:
         """Paragraphs for the panel."""
         if self.packed is None:
-            count, total = len(self.map().splats), self.map().total
+            count, total = self.map().at_once, self.map().total
         else:
-            count, total = self.packed.count, self.packed.total
+            count, total = self.packed.at_once, self.packed.total
         of_all = f"{len(self.path.poses)} poses, {count} of {total} Gaussians"
         said = f"{printable(self.folder.name)}: {of_all}\n\n{frame_in_words(self.frame)}"
         return "\n\n".join(filter(None, (said, note_unfinished(self.folder))))
@@ -136,7 +136,7 @@ def fill(page: ViewerPage, dive: FinishedDive) -> None:
     if dive.packed is not None:
         page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)
     else:
-        page.show_splats(dive.splats, dive.water, dive.palettes)
+        page.show_packed(dive.map().packed, lambda: dive.splats, dive.water, dive.palettes)
     path = dive.path.thin()
     page.show_path(path.rows, path.moments, path.began)
     page.show_pictures(path.pictures)

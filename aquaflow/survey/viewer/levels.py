@@ -22,6 +22,8 @@ VIRIDIS: tuple[RGB, ...] = (
 """Five colours of it; readable without red and green."""
 RANGE = "range"
 """Name of the level that the page hides by."""
+MOST_JUDGED = 1 << 18
+"""Gaussians that the palette is chosen by; more are thinned."""
 MOST_CAMERAS = 5000
 """Poses that ranges are taken from; more are thinned."""
 
@@ -48,21 +50,48 @@ class Palette:
         }  # fmt: skip
 
 
+class RangeLevel:
+    """How far Gaussians lie from the path."""
+
+    def __init__(
+        self,
+        centres: Float,  # [N, 3] of some Gaussians, by which the palette is chosen
+        cameras: Float,  # [M, 3], M > 0
+        unit: str,
+        metres: float = 1.0,
+    ) -> None:
+        """Distances are in ``unit``, of which one of the coordinates has ``metres``."""
+        self._tree = cKDTree(cameras[:: max(1, -(-len(cameras) // MOST_CAMERAS))])
+        distances = self._distances(centres[:: max(1, -(-len(centres) // MOST_JUDGED))])
+        largest = float(np.percentile(distances, 99.0)) * 1.25 if len(distances) else 1.0
+        self._largest = largest if np.isfinite(largest) and largest > 0.0 else 1.0
+        label = "by distance from the path"
+        self.palette = Palette(label, VIRIDIS, largest=metres * self._largest, unit=unit)
+
+    def _distances(
+        self,
+        centres: Float,  # [N, 3]
+    ) -> npt.NDArray[np.float64]:
+        return np.asarray(self._tree.query(np.nan_to_num(centres))[0])
+
+    def of(
+        self,
+        centres: Float,  # [N, 3]
+    ) -> npt.NDArray[np.uint8]:
+        """[N] distance of each Gaussian to the nearest camera."""
+        shares = np.clip(self._distances(centres) / self._largest, 0.0, 1.0)
+        return np.asarray(np.rint(255.0 * shares), np.uint8)
+
+
 def range_level(
     centres: Float,  # [N, 3]
     cameras: Float,  # [M, 3], M > 0
     unit: str,
     metres: float = 1.0,
 ) -> tuple[npt.NDArray[np.uint8], Palette]:
-    """Distance [N] of each Gaussian to the nearest camera, and its palette: in ``unit``, of which
-    one of the coordinates has ``metres``."""
-    thinned = cameras[:: max(1, -(-len(cameras) // MOST_CAMERAS))]
-    distances = np.asarray(cKDTree(thinned).query(np.nan_to_num(centres))[0])
-    largest = float(np.percentile(distances, 99.0)) * 1.25 if len(distances) else 1.0
-    largest = largest if np.isfinite(largest) and largest > 0.0 else 1.0
-    values = np.rint(255.0 * np.clip(distances / largest, 0.0, 1.0)).astype(np.uint8)
-    label = "by distance from the path"
-    return values, Palette(label, VIRIDIS, largest=metres * largest, unit=unit)
+    """The :class:`RangeLevel` of all these Gaussians [N], and its palette."""
+    level = RangeLevel(centres, cameras, unit, metres)
+    return level.of(centres), level.palette
 
 
 def steps_level(

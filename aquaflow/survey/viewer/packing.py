@@ -20,10 +20,11 @@ import logging
 import threading
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +49,7 @@ LARGEST = 65_535
 
 
 @dataclass(frozen=True)
-class _Code:
+class PackedCode:
     """What numbers of bytes stand for."""
 
     middle: npt.NDArray[np.float64]
@@ -58,17 +59,46 @@ class _Code:
     brightest: float
 
     @staticmethod
-    def of(splats: ViewerSplats) -> _Code:
-        """The code for these Gaussians."""
-        middle, half = _box(splats.centres)
-        return _Code(middle, half, _log_scales(splats.scales), _brightest(splats.colours))
+    def of(splats: ViewerSplats, others: ViewerSplats | None = None) -> PackedCode:
+        """The code for these Gaussians, and for scales as those of ``others``."""
+        middle, half = inner_box(splats.centres)
+        scales = splats.scales
+        if others is not None:
+            scales = np.concatenate([scales, others.scales])
+        return PackedCode(middle, half, _log_scales(scales), _brightest(splats.colours))
+
+    def in_box(
+        self,
+        middle: npt.NDArray[np.float64],  # [3]
+        half: npt.NDArray[np.float64],  # [3]
+    ) -> PackedCode:
+        """The same for places around another middle."""
+        return replace(self, middle=middle, half=half)
+
+
+class MoreDetail(Protocol):
+    """Tiles of a map of which the chunks are only what covers most (map_tiles.py)."""
+
+    code: PackedCode
+
+    def description(self) -> dict[str, Any]:
+        """What a browser needs to choose tiles and to read them."""
+        ...
+
+    def parts(self) -> Iterator[tuple[int, int]]:
+        """Numbers of each tile and each of its parts."""
+        ...
+
+    def part(self, number: int, part: int) -> bytes | None:
+        """Gzipped; None if there is no such part."""
+        ...
 
 
 class Packed:
     """Splats as a description and chunks of bytes, which are packed when first asked for."""
 
-    def __init__(self, splats: ViewerSplats) -> None:
-        self._splats = splats
+    def __init__(self, splats: ViewerSplats, tiles: MoreDetail | None = None) -> None:
+        self._splats, self.tiles = splats, tiles
         self._ends = chunk_ends(len(splats))
         self._chunks: dict[int, bytes] = {}
         self._lock = threading.Lock()
@@ -84,8 +114,12 @@ class Packed:
         return _digest(self._splats)
 
     @cached_property
-    def _code(self) -> _Code:
-        return _Code.of(self._splats)
+    def _code(self) -> PackedCode:
+        return PackedCode.of(self._splats) if self.tiles is None else self.tiles.code
+
+    @cached_property
+    def _tiles(self) -> dict[str, Any]:
+        return {} if self.tiles is None else {"tiles": self.tiles.description()}
 
     def description(self) -> dict[str, Any]:
         """What a browser needs to read the chunks."""
@@ -104,6 +138,7 @@ class Packed:
             "log_scales": self._code.log_scales,
             "brightest": self._code.brightest,
             "levels": list(self._splats.levels),
+            **self._tiles,
         }
 
     def chunk(self, number: int) -> bytes | None:
@@ -113,26 +148,27 @@ class Packed:
         with self._lock:
             if number not in self._chunks:
                 first = self._ends[number - 1] if number else 0
-                raw = self._columns(slice(first, self._ends[number]))
+                part = self._splats.among(slice(first, self._ends[number]))
+                raw = columns_of(part, self._code)
                 self._chunks[number] = gzip.compress(raw, GZIP_LEVEL, mtime=0)
             return self._chunks[number]
 
-    def _columns(self, part: slice) -> bytes:
-        shown, code = self._splats, self._code
-        inside = contract(shown.centres[part].astype(np.float64), code.middle, code.half)
-        places = np.rint((inside + 2.0) * (LARGEST / 4.0)).astype("<u2")
-        wxyz = shown.wxyz[part]
-        turned = np.where(wxyz[:, :1] < 0.0, -wxyz, wxyz)
-        low, high = code.log_scales
-        scales = (np.log(np.maximum(shown.scales[part], 1e-30)) - low) / (high - low)
-        columns = [
-            np.rint(127.0 * turned).astype(np.int8),
-            _bytes(scales),
-            _bytes(shown.opacities[part, None]),
-            _bytes(shown.colours[part] / code.brightest),
-            *(values[part, None] for values in shown.levels.values()),
-        ]
-        return b"".join(np.ascontiguousarray(each.T).tobytes() for each in (places, *columns))
+
+def columns_of(shown: ViewerSplats, code: PackedCode) -> bytes:
+    """The columns of a chunk."""
+    inside = contract(shown.centres.astype(np.float64), code.middle, code.half)
+    places = np.rint((inside + 2.0) * (LARGEST / 4.0)).astype("<u2")
+    turned = np.where(shown.wxyz[:, :1] < 0.0, -shown.wxyz, shown.wxyz)
+    low, high = code.log_scales
+    scales = (np.log(np.maximum(shown.scales, 1e-30)) - low) / (high - low)
+    columns = [
+        np.rint(127.0 * turned).astype(np.int8),
+        _bytes(scales),
+        _bytes(shown.opacities[:, None]),
+        _bytes(shown.colours / code.brightest),
+        *(values[:, None] for values in shown.levels.values()),
+    ]
+    return b"".join(np.ascontiguousarray(each.T).tobytes() for each in (places, *columns))
 
 
 def bytes_of_each(levels: int) -> int:
@@ -167,7 +203,7 @@ def _bytes(
     return np.asarray(np.rint(255.0 * np.clip(shares, 0.0, 1.0)), np.uint8)
 
 
-def _box(
+def inner_box(
     centres: Float,  # [N, 3]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Middle and half the size [3] of the box that holds nearly all; the same size each way."""
@@ -213,7 +249,7 @@ log = logging.getLogger(__name__)
 
 NAME = "view.zip"
 """In a dive's folder (docs/formats.md#view)."""
-FORMAT = 2
+FORMAT = 3
 """Raised whenever a browser is sent something else of the same files."""
 SOURCES = (
     *(
@@ -229,10 +265,12 @@ SOURCES = (
 """Files of a dive that the packed map depends on."""
 ABOUT = "about.json"
 """Member beside the chunks, which have numbers as names."""
-MOST_ABOUT_BYTES = 1 << 20
-"""It has some kB: palettes and 10 to 20 chunks' ends."""
+MOST_ABOUT_BYTES = 1 << 22
+"""It has some kB: palettes, 10 to 20 chunks' ends, and 250 bytes of each tile."""
 MOST_GAUSSIANS = 1 << 22
 """More are packed at every look: a browser shows some 500,000."""
+MOST_TILES, MOST_PARTS, MOST_IN_PART = 1 << 14, 4, 1 << 17
+"""Of a map in a file; tiles have two parts and some 30,000 Gaussians."""
 MOST_LEVELS = 16
 """Of a Gaussian; a dive has at most 4."""
 GZIP_BYTES, BLOCK_BYTES = 1024, 1 << 16
@@ -259,6 +297,11 @@ class PackedFile:
         """Gaussians."""
         return int(self.about["count"])
 
+    @property
+    def at_once(self) -> int:
+        """Gaussians that a browser shows at most."""
+        return int(self.about["tiles"]["budget"]) if "tiles" in self.about else self.count
+
     def description(self) -> dict[str, Any]:
         """What a browser needs to read the chunks."""
         return dict(self.about)
@@ -267,30 +310,59 @@ class PackedFile:
         """Gzipped; None if there is no such chunk, or the file is gone or another one by now."""
         if not 0 <= number < len(self.about["ends"]):
             return None
+        return self.member(str(number), (0, *self.about["ends"])[number : number + 2])
+
+    def member(self, name: str, ends: Sequence[int]) -> bytes | None:
+        """Gzipped, with the Gaussians between both ``ends``."""
+        count = ends[1] - ends[0]
         try:
             with open_archive(self.path, stored=True) as file:
                 if _about(file)["map"]["version"] != self.version:
                     return None
-                return self._chunk(file, number)
+                return _whole(file, name, count * bytes_of_each(len(self.about["levels"])))
         except UNREADABLE as error:
             log.warning("%s was removed or damaged while it was shown: %s", self.path, error)
             return None
 
-    def _chunk(self, file: zipfile.ZipFile, number: int) -> bytes:
-        """Of the length that its Gaussians have, also in a browser, which unpacks it."""
-        ends = (0, *self.about["ends"])
-        size = (ends[number + 1] - ends[number]) * bytes_of_each(len(self.about["levels"]))
-        packed = read_member(file, str(number), most_bytes=size + size // 64 + GZIP_BYTES)
-        unpacking, waiting, there = zlib.decompressobj(zlib.MAX_WBITS | 16), packed, 0
-        while not unpacking.eof and there <= size:
-            block = unpacking.decompress(waiting, BLOCK_BYTES)
-            waiting = unpacking.unconsumed_tail
-            if not block and not waiting:  # it is cut short
-                break
-            there += len(block)
-        if there != size or not unpacking.eof or unpacking.unused_data:
-            raise DamagedError("a chunk is longer or shorter than its Gaussians")
-        return packed
+    @property
+    def tiles(self) -> PackedTiles | None:
+        """Those of a large map."""
+        return PackedTiles(self) if "tiles" in self.about else None
+
+
+@dataclass(frozen=True)
+class PackedTiles:
+    """The tiles of a map in a file."""
+
+    file: PackedFile
+
+    def part(self, number: int, part: int) -> bytes | None:
+        """Gzipped; None if there is no such part, or the file is gone or another one by now."""
+        tiles = self.file.about["tiles"]["list"]
+        if not (0 <= number < len(tiles) and 0 <= part < len(tiles[number]["ends"])):
+            return None
+        ends = (0, *tiles[number]["ends"])
+        return self.file.member(_name(number, part), ends[part : part + 2])
+
+
+def _name(number: int, part: int) -> str:
+    """Of a part of a tile in the file."""
+    return f"tile {number} {part}"
+
+
+def _whole(file: zipfile.ZipFile, name: str, size: int) -> bytes:
+    """A member that unpacks to ``size`` bytes, also in a browser, which unpacks it."""
+    packed = read_member(file, name, most_bytes=size + size // 64 + GZIP_BYTES)
+    unpacking, waiting, there = zlib.decompressobj(zlib.MAX_WBITS | 16), packed, 0
+    while not unpacking.eof and there <= size:
+        block = unpacking.decompress(waiting, BLOCK_BYTES)
+        waiting = unpacking.unconsumed_tail
+        if not block and not waiting:  # it is cut short
+            break
+        there += len(block)
+    if there != size or not unpacking.eof or unpacking.unused_data:
+        raise DamagedError("a chunk is longer or shorter than its Gaussians")
+    return packed
 
 
 def key_of(dive: Path, budget: int) -> dict[str, Any]:
@@ -320,7 +392,7 @@ def read_packed(dive: Path, key: dict[str, Any]) -> PackedFile | None:
                 raise DamagedError("its chunks are no chunks of its Gaussians, or too many")
             if len(said["map"]["levels"]) > MOST_LEVELS:
                 raise DamagedError("its Gaussians have too many levels")
-            if not {str(number) for number in chunks} <= names:
+            if not {str(number) for number in chunks} | _tile_names(said["map"]) <= names:
                 return None
         palettes = {name: _palette(each) for name, each in said["palettes"].items()}
         return PackedFile(said["map"], palettes, int(said["total"]), path)
@@ -329,6 +401,23 @@ def read_packed(dive: Path, key: dict[str, Any]) -> PackedFile | None:
     except UNREADABLE as error:
         log.warning("%s is damaged and made anew: %s", path, reason_of(error))
         return None
+
+
+def _tile_names(about: dict[str, Any]) -> set[str]:
+    """Of all parts of all tiles.
+
+    Raises:
+        DamagedError: they are no tiles, or too many.
+    """
+    names = set()
+    for number, tile in enumerate(about.get("tiles", {"list": []})["list"]):
+        ends = tile["ends"]
+        if not all(isinstance(end, int) and 0 < end <= MOST_IN_PART for end in ends):
+            raise DamagedError("its tiles have no Gaussians, or too many")
+        if number >= MOST_TILES or len(ends) > MOST_PARTS or list(ends) != sorted(ends):
+            raise DamagedError("it has too many tiles, or some of no order")
+        names |= {_name(number, part) for part in range(len(ends))}
+    return names
 
 
 def write_packed(
@@ -340,12 +429,14 @@ def write_packed(
         "key": key, "map": about, "total": total,
         "palettes": {name: each.to_json() for name, each in palettes.items()},
     }  # fmt: skip
-    chunks = [packed.chunk(number) or b"" for number in range(len(about["ends"]))]
+    tiles = packed.tiles
     try:
         with atomic_write(dive / NAME) as stream, zipfile.ZipFile(stream, "w") as file:
             file.writestr(ABOUT, json.dumps(said))
-            for number, chunk in enumerate(chunks):
-                file.writestr(str(number), chunk)
+            for number in range(len(about["ends"])):
+                file.writestr(str(number), packed.chunk(number) or b"")
+            for number, part in () if tiles is None else tiles.parts():
+                file.writestr(_name(number, part), tiles.part(number, part) or b"")
     except InputError as error:
         log.info("the packed map is not kept: %s", error)
 

@@ -102,12 +102,12 @@ class ViewerPage:
 
     def show_packed(
         self,
-        packed: PackedFile,
+        packed: Packed | PackedFile,
         splats: Callable[[], ViewerSplats],
         water: SeenWater | None,
         palettes: dict[str, Palette],
     ) -> None:
-        """A map that was packed before; ``splats`` are its Gaussians for who points at them."""
+        """A map as browsers get it; ``splats`` are its Gaussians for who points at them."""
         self._exhibit.map = ShownMap(splats, packed, water, palettes)
 
     def show_path(
@@ -247,6 +247,9 @@ class ViewerServer:
         if name == "map" and len(rest) == 2 and _is_number(rest[1]):
             packed = self._exhibit.chunk(rest[0], int(rest[1]))
             return None if packed is None else _of(200, BINARY, packed, [GZIPPED], FOR_EVER)
+        if name == "tile" and len(rest) == 3 and _is_number(rest[1]) and _is_number(rest[2]):
+            tile = self._exhibit.tile(rest[0], int(rest[1]), int(rest[2]))
+            return None if tile is None else _of(200, BINARY, tile, [GZIPPED], FOR_EVER)
         if name == "path" and len(rest) == 1:
             return _of(200, BINARY, self._exhibit.path.astype("<f4").tobytes())
         if name == "picture" and rest == ["newest"]:

@@ -104,7 +104,7 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
         all_of.means, all_of.wxyz, all_of.scales, all_of.opacities, all_of.colours, budget, levels,
         floaters,
     )  # fmt: skip
-    return DiveMap(found, palettes, len(all_of.means))
+    return DiveMap(lambda: found, palettes, len(all_of.means))
 
 
 def _own_map(placed: PlacedDive) -> PlyGaussians:

@@ -72,16 +72,38 @@ def splats(
     chosen = order[sound[order]][:budget]
     surface = ~floats[chosen]
     share = float(weight[chosen[surface]].sum() / max(float(weight[~floats].sum()), 1e-12))
-    # Areas grow by the root of what was left out: twice the gaps, no mud.
-    grown = 1.0 if surface.sum() == (sound & ~floats).sum() else min(max(share, 0.25), 1.0) ** -0.25
+    grown = 1.0 if surface.sum() == (sound & ~floats).sum() else growth(share)
+    own = {name: values[chosen] for name, values in (levels or {}).items()}
+    return viewer_splats(
+        means[chosen], quats[chosen], grown * scales[chosen], opacities[chosen], colours[chosen],
+        own, int((~surface).sum()),
+    )  # fmt: skip
+
+
+def growth(share: float) -> float:
+    """Factor by which those grow that cover this share of the surface: areas by the root of what
+    was left out: twice the gaps, no mud."""
+    return float(min(max(share, 0.25), 1.0) ** -0.25)
+
+
+def viewer_splats(
+    means: Float,  # [N, 3]
+    quats: Float,  # [N, 4] wxyz, of any length
+    scales: Float,  # [N, 3]
+    opacities: Float,  # [N]
+    colours: Float,  # [N, 3]
+    levels: dict[str, Levels],  # [N] each
+    floaters: int = 0,
+) -> ViewerSplats:
+    """Finite Gaussians in their order, the last of which float."""
     return ViewerSplats(
-        means[chosen].astype(np.float32),
-        _unit(quats[chosen]),
-        (grown * scales[chosen]).astype(np.float32),
-        np.clip(opacities[chosen], 0.0, 1.0).astype(np.float32),
-        np.maximum(colours[chosen], 0.0).astype(np.float32),
-        {name: values[chosen] for name, values in (levels or {}).items()},
-        int((~surface).sum()),
+        means.astype(np.float32),
+        _unit(quats),
+        scales.astype(np.float32),
+        np.clip(opacities, 0.0, 1.0).astype(np.float32),
+        np.maximum(colours, 0.0).astype(np.float32),
+        levels,
+        floaters,
     )
 
 

@@ -147,6 +147,13 @@ class ViewerContent:
             return None
         return shown.packed.chunk(number)
 
+    def tile(self, version: str, number: int, part: int) -> bytes | None:
+        """Gzipped part of a tile, of the map of that version; None where there is none."""
+        shown = self.map
+        if shown is None or shown.packed.version != version or shown.packed.tiles is None:
+            return None
+        return shown.packed.tiles.part(number, part)
+
     def picture(self, index: int) -> bytes | None:
         """JPEG of what the camera saw at a frame; None where nothing is kept."""
         path = self.pictures.get(index)

@@ -16,7 +16,7 @@ const CLEAR = {
 export class Drawing {
   // `drawn(drawing)` is called after each picture.
   constructor(canvas, drawn) {
-    Object.assign(this, { canvas, drawn, about: null, next: null, count: 0, began: null, moving: false });
+    Object.assign(this, { canvas, drawn, about: null, next: null, count: 0, detail: 0, began: null, moving: false });
     this.look = { water: 0, through: 1, wipe: null, level: -1, rangeLevel: -1, within: 255, all: false };
     this.cost_us = 5; // of a Gaussian; measured from the first picture on
   }
@@ -37,18 +37,18 @@ export class Drawing {
     Object.assign(this, { canvas, began: null, wanted: true });
     this.renderer = new WebGl(this);
     for (const map of new Set([this.shown, this.next].filter(Boolean))) {
-      const { parts } = map.room;
-      map.room = this.renderer.room(map.about);
-      for (const part of parts) this.renderer.put(map.room, ...part);
+      const { parts, count } = map.room;
+      map.room = this.renderer.room(count);
+      for (const part of parts.values()) this.renderer.put(map.room, ...part);
     }
     if (this.shown) this.renderer.show(this.shown.room);
     if (this.palette) this.renderer.colours(this.palette);
   }
 
-  // Room for a map, which is shown from its first chunk on if none is there, else when it is whole.
+  // Room for a map and its tiles, which is shown from its first chunk on if none is there, else when it is whole.
   begin(about) {
     if (this.next && this.next !== this.shown) this.renderer.free(this.next.room);
-    this.next = { about, room: this.renderer.room(about), count: 0 };
+    this.next = { about, room: this.renderer.room(Math.max(about.count, about.tiles?.budget ?? 0)), count: 0 };
     if (!this.about) this.swap();
   }
 
@@ -61,11 +61,17 @@ export class Drawing {
     this.wanted = true;
   }
 
+  // Puts others in place of those from `first` on.
+  replace(part, first) {
+    this.renderer.put(this.shown.room, part, first, first + part.places.length / 3);
+    this.wanted = true;
+  }
+
   swap() {
     if (this.shown) this.renderer.free(this.shown.room);
     this.shown = this.next;
     this.renderer.show(this.shown.room);
-    Object.assign(this, { about: this.shown.about, count: this.shown.count, wanted: true });
+    Object.assign(this, { about: this.shown.about, count: this.shown.count, detail: 0, wanted: true });
   }
 
   // One colour for each of the 256 values of a level.
@@ -76,11 +82,15 @@ export class Drawing {
 
   // How many are drawn now: as many as the device draws in time; what that is, the first chunk tells.
   get limit() {
-    const { about, look } = this, wanted = Math.min(this.count, about.count - (look.all ? 0 : about.floaters));
-    if (this.shownAt === undefined) return Math.min(wanted, about.ends[0]);
-    const most = (this.moving ? MOVING_MS : STILL_MS) * 1000 / this.cost_us / (this.look.wipe === null ? 1 : 2);
-    return Math.min(wanted, Math.max(FEWEST, Math.round(most)));
+    const { about, look } = this, surface = Math.min(this.count, about.count - (look.all ? 0 : about.floaters));
+    if (this.shownAt === undefined) return Math.min(surface, about.ends[0]);
+    return Math.min(Math.max(surface, this.detail), this.inTime(this.moving ? MOVING_MS : STILL_MS));
   }
+
+  // How many could be drawn while the eye rests.
+  get most() { return this.inTime(STILL_MS); }
+
+  inTime(ms) { return Math.max(FEWEST, Math.round(ms * 1000 / this.cost_us / (this.look.wipe === null ? 1 : 2))); }
 
   // Whether what is on the screen is the last word.
   get still() { return !this.wanted && !this.late && this.began === null && !this.renderer.sorting; }
@@ -132,7 +142,7 @@ export class Drawing {
 
   // While some are missing, those that are there grow by part of what these would cover.
   grown() {
-    const { ends, covered } = this.about, limit = this.limit;
+    const { ends, covered, count } = this.about, limit = Math.min(this.limit, count);
     const k = ends.findIndex(end => end >= limit), before = k > 0 ? ends[k - 1] : 0;
     const [low, high] = [k > 0 ? covered[k - 1] : 0, covered[k]];
     const share = low + (high - low) * (limit - before) / Math.max(1, ends[k] - before);

@@ -1,6 +1,6 @@
 // The map's chunks as the server packs them (aquaflow/survey/viewer/packing.py), turned into texels.
 
-export const WORDS = 8; // of 32 bits, two texels for each Gaussian
+export const WORDS = 8; // of 32 bits, two texels for each Gaussian; the last three are its place
 
 // Words and places of the Gaussians in one chunk.
 export function unpacked(bytes, count, about) {
@@ -10,16 +10,15 @@ export function unpacked(bytes, count, about) {
   const column = k => rest.subarray(k * count, (k + 1) * count);
   const [qw, qx, qy, qz, s0, s1, s2, alpha, r, g, b] = Array.from({ length: 11 }, (_, k) => column(k));
   const none = new Uint8Array(count), levels = [0, 1, 2].map(k => k < about.levels.length ? column(11 + k) : none);
-  const words = new Uint32Array(WORDS * count), places = new Float32Array(3 * count);
+  const words = new Uint32Array(WORDS * count), places = new Float32Array(3 * count), floats = new Float32Array(words.buffer);
   for (let i = 0, w = 0; i < count; i++, w += WORDS) {
-    words[w] = shorts[i] | (shorts[count + i] << 16);
-    words[w + 1] = shorts[2 * count + i] | (s0[i] << 16) | (s1[i] << 24);
+    words[w + 1] = (s0[i] << 16) | (s1[i] << 24);
     words[w + 2] = s2[i] | (alpha[i] << 8) | (r[i] << 16) | (g[i] << 24);
     words[w + 3] = b[i] | (levels[0][i] << 8) | (levels[1][i] << 16) | (levels[2][i] << 24);
     words[w + 4] = qw[i] | (qx[i] << 8) | (qy[i] << 16) | (qz[i] << 24);
     for (let k = 0; k < 3; k++) {
       const u = shorts[k * count + i] * (4 / 65535) - 2, far = Math.min(Math.abs(u), 1.9999);
-      places[3 * i + k] = about.middle[k] + about.half[k] * (far < 1 ? u : Math.sign(u) / (2 - far));
+      floats[w + 5 + k] = places[3 * i + k] = about.middle[k] + about.half[k] * (far < 1 ? u : Math.sign(u) / (2 - far));
     }
   }
   return { words, places };

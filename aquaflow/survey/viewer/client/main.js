@@ -7,6 +7,7 @@ import { Link } from "./link.js";
 import { asked, chunk, loadMap, tell } from "./load.js";
 import { Looks } from "./looks.js";
 import { Marks } from "./marks.js";
+import { Tiles } from "./tiles.js";
 import { TimeLine } from "./timeline.js";
 import { ToolBox } from "./tools.js";
 import { divider } from "./wipe.js";
@@ -15,7 +16,7 @@ const ASK_MS = 500; // between two questions for what is new in a live dive
 const find = id => document.getElementById(id);
 const say = text => { find("said").textContent = text; };
 
-let scene = null, drawing = null, looking = false, pathShown = -1, loading = false, wrong = "";
+let scene = null, drawing = null, detail = null, looking = false, pathShown = -1, loading = false, wrong = "";
 
 const changed = () => {
   if (drawing) drawing.wanted = true;
@@ -23,7 +24,7 @@ const changed = () => {
 };
 // In ms since the address was opened: the script runs, a first chunk is there, a first picture is on
 // the screen, the whole map is drawn. And what a Gaussian costs, and whether nothing is left to draw.
-const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; } };
+const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; }, get tiles() { return detail?.shown; } };
 const drawn = () => {
   marks.camera = line.camera;
   marks.draw(eye);
@@ -80,11 +81,17 @@ find("fold").addEventListener("click", () => {
 
 // One map after the other: the next one is asked for when this one is whole.
 async function showMap(about, coming) {
+  const base = []; // of a map with tiles, which hide parts of it
   loading = true;
   try {
     drawing.begin(about);
     marks.size = about.half[0];
-    await loadMap(about, coming, (part, first, end) => { times.data ??= performance.now(); drawing.put(part, first, end); });
+    await loadMap(about, coming, (part, first, end) => {
+      times.data ??= performance.now();
+      if (about.tiles) base.push({ words: part.words, places: part.places.slice() });
+      drawing.put(part, first, end);
+    });
+    detail = about.tiles ? new Tiles(drawing, about, base) : null;
   } finally { loading = false; }
 }
 
@@ -125,7 +132,7 @@ async function begin() {
   drawing = await Drawing.on(find("map"), drawn);
   looks.begin(drawing, divider(find("divider"), find("view"), share => { drawing.look.wipe = looks.wiping ? share : null; changed(); }));
   tools.offer(scene.can);
-  const turn = () => { drawing.turn(eye); requestAnimationFrame(turn); };
+  const turn = () => { drawing.turn(eye); detail?.look(eye); requestAnimationFrame(turn); };
   requestAnimationFrame(turn);
 }
 

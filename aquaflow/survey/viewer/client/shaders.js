@@ -5,19 +5,13 @@ export const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D data; uniform sampler2D palette;
 uniform mat3 axes; uniform vec3 place; uniform vec2 focal, centre, size;
-uniform vec3 middle, extent; uniform vec2 logScales; uniform float brightest, grown, nearest;
+uniform vec2 logScales; uniform float brightest, grown, nearest;
 uniform vec3 beta, Binf, b, Bres, d, gain, white, lamp; uniform float water, through, compression, shownCompression;
 uniform int level, rangeLevel; uniform float within;
 in vec2 corner; in uint index;
 out vec4 colour; out vec2 at;
 
 vec4 bytes(uint word) { return vec4(uvec4(word, word >> 8, word >> 16, word >> 24) & 255u); }
-
-vec3 position(uvec2 words) {
-  vec3 u = vec3(uvec3(words.x & 65535u, words.x >> 16, words.y & 65535u)) * (4.0 / 65535.0) - 2.0;
-  vec3 far = min(abs(u), 1.9999);
-  return middle + extent * mix(u, sign(u) / (2.0 - far), step(1.0, far));
-}
 
 mat3 rotation(vec4 q) {
   float w = q.x, x = q.y, y = q.z, z = q.w;
@@ -50,7 +44,7 @@ void main() {
   uvec4 one = texelFetch(data, texel, 0), two = texelFetch(data, texel + ivec2(1, 0), 0);
   vec4 levels = vec4(bytes(one.w).yzw, 0.0);
   if (rangeLevel >= 0 && levels[rangeLevel] > within) return;
-  vec3 t = transpose(axes) * (position(one.xy) - place);
+  vec3 t = transpose(axes) * (uintBitsToFloat(two.yzw) - place);
   if (t.z < nearest) return;
   vec2 limit = 1.3 * size / (2.0 * focal);
   vec2 slope = clamp(t.xy / t.z, -limit, limit);

@@ -10,7 +10,7 @@ function sorted({ place, ahead, nearest, count }) {
   let shown = 0, low = Infinity, high = -Infinity;
   for (let i = 0, k = 0; i < count; i++, k += 3) {
     const depth = (places[k] - place[0]) * ahead[0] + (places[k + 1] - place[1]) * ahead[1] + (places[k + 2] - place[2]) * ahead[2];
-    if (depth < nearest) continue;
+    if (!(depth >= nearest)) continue; // nor what has no place
     depths[shown] = depth;
     among[shown++] = i;
     if (depth < low) low = depth;

@@ -3,16 +3,13 @@
 
 struct Side {
   place: vec3f, nearest: f32,  // the eye, and from which depth on something is shown; map units
-  middle: vec3f, brightest: f32,
-  extent: vec3f, grown: f32,
   log_scales: vec2f, water: f32, through: f32,
+  brightest: f32, grown: f32, level: f32, range_level: f32,  // whose colours are shown; negative: a picture's; whose values hide
   beta: vec3f, compression: f32,
   B_inf: vec3f, shown_compression: f32,
-  b: vec3f, level: f32,  // whose colours are shown; negative: a picture's
-  B_res: vec3f, range_level: f32,  // what exceeds `within` in it is hidden; negative: nothing
-  d: vec3f, within: f32,
-  gain: vec3f, count: f32,
-  white: vec3f, lamp: vec3f,
+  b: vec3f, within: f32,  // what exceeds it in `range_level` is hidden; nothing where that is negative
+  B_res: vec3f, count: f32,
+  d: vec3f, gain: vec3f, white: vec3f, lamp: vec3f,
   background: vec4f,
 }
 
@@ -26,12 +23,6 @@ struct Side {
 @group(0) @binding(7) var<storage, read> radius_px: array<f32>;
 
 fn bytes(word: u32) -> vec4f { return vec4f((vec4u(word) >> vec4u(0, 8, 16, 24)) & vec4u(255)); }
-
-fn position(words: vec2u) -> vec3f {
-  let u = vec3f(vec3u(words.x & 0xffff, words.x >> 16, words.y & 0xffff)) * (4.0 / 65535.0) - 2;
-  let far = min(abs(u), vec3f(1.9999));
-  return side.middle + side.extent * mix(u, sign(u) / (2 - far), step(vec3f(1), far));
-}
 
 // Highlights drawn together, or with -c apart again (aquaflow/water/tone.py).
 fn toned(bright: vec3f, c: f32) -> vec3f {
@@ -60,7 +51,7 @@ fn unpack(@builtin(global_invocation_id) id: vec3u) {
   let levels = array<f32, 3>(third.y, third.z, third.w);
   let hidden = side.range_level >= 0 && levels[u32(max(side.range_level, 0))] > side.within;
   let unit = NEAR_PLANE_M / side.nearest;
-  let t = position(one.xy) - side.place;
+  let t = bitcast<vec3f>(two.yzw) - side.place;
   let scale = exp(side.log_scales.x + vec3f(first.zw, second.x) / 255.0 * (side.log_scales.y - side.log_scales.x));
   let clear = vec3f(second.zw, third.x) / 255.0 * side.brightest;
   var shown: vec3f;

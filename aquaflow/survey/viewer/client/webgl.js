@@ -54,8 +54,8 @@ export class WebGl {
     return made;
   }
 
-  // A place for a map's Gaussians, and the worker that sorts them.
-  room({ count }) {
+  // A place for `count` Gaussians, and the worker that sorts them.
+  room(count) {
     const gl = this.gl, data = this.texture(gl.TEXTURE0), worker = new Worker("/client/sort.js");
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * WIDTH, Math.max(1, Math.ceil(count / WIDTH)));
     worker.postMessage({ begin: count });
@@ -116,8 +116,6 @@ export class WebGl {
     gl.uniform2f(this.at("focal"), fx, fy);
     gl.uniform2f(this.at("centre"), cx, cy);
     gl.uniform2f(this.at("size"), width, height);
-    three("middle", about.middle);
-    three("extent", about.half);
     gl.uniform2fv(this.at("logScales"), about.log_scales);
     gl.uniform1f(this.at("brightest"), about.brightest);
     gl.uniform1f(this.at("grown"), grown);

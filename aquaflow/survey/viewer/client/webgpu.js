@@ -51,12 +51,12 @@ export class WebGpu {
     return this.device.createBuffer({ size: 4 * Math.max(4, numbers), usage: (uniform ? use.UNIFORM : use.STORAGE) | use.COPY_DST });
   }
 
-  // A place for a map's Gaussians; `parts` is what another device would need to draw them.
-  room({ count }) { return { count, words: this.buffer(WORDS * count), parts: [] }; }
+  // A place for `count` Gaussians; `parts`, by their first, are what another device would need to draw them.
+  room(count) { return { count, words: this.buffer(WORDS * count), parts: new Map() }; }
 
   put(room, part, first, end) {
     this.device.queue.writeBuffer(room.words, 4 * WORDS * first, part.words);
-    room.parts.push([part, first, end]);
+    room.parts.set(first, [part, first, end]);
   }
 
   free(room) {
@@ -131,10 +131,9 @@ export class WebGpu {
     new Uint32Array(camera.buffer).set([width, height, 1, 1, count], 20); // one tile: nobody asks which ones are hit
     queue.writeBuffer(this.camera, 0, camera);
     sides.forEach((side, k) => queue.writeBuffer(this.sides, SLOT * k, new Float32Array([
-      ...eye.place, nearest, ...about.middle, about.brightest, ...about.half, grown,
-      ...about.log_scales, side.water, look.through, ...water.beta, water.compression, ...water.B_inf, water.shown_compression,
-      ...water.b, look.level, ...water.B_res, look.rangeLevel, ...water.d, look.within, ...water.gain, count,
-      ...water.white, 0, ...water.lamp, 0, ...side.background, 1])));
+      ...eye.place, nearest, ...about.log_scales, side.water, look.through, about.brightest, grown, look.level, look.rangeLevel,
+      ...water.beta, water.compression, ...water.B_inf, water.shown_compression, ...water.b, look.within, ...water.B_res, count,
+      ...water.d, 0, ...water.gain, 0, ...water.white, 0, ...water.lamp, 0, ...side.background, 1])));
     queue.writeBuffer(this.total, 0, new Uint32Array([count]));
     const passes = new Uint32Array((PASSES + 1) * SLOT / 4);
     for (let k = 0; k < PASSES; k++) passes.set([DIGIT_BITS * k, blocks, k === 0], k * SLOT / 4);
