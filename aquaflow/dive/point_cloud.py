@@ -117,7 +117,7 @@ def nearest_cameras(
     left, first, last = np.arange(len(points)), 0, NEAREST_CAMERAS
     while len(left) and first < len(views):  # of nearly all points one of the nearest shows it
         ranks = np.arange(first, min(last, len(views))) + 1
-        numbers = tree.query(points[left], k=ranks)[1]
+        numbers = np.asarray(tree.query(points[left], k=ranks)[1])
         shown = _shown_by(points[left], numbers, views)
         rows = np.flatnonzero(shown.any(axis=1))
         found[left[rows]] = centres[numbers[rows, shown[rows].argmax(axis=1)]]

@@ -241,6 +241,7 @@ class Mapper:
         """Let these tiles leave memory."""
         if not keyframes:
             return
+        self.scene.go_on()
         self.optimiser.settle()
         self.optimiser.keep(self.tiles.leave(self.gaussians, self.optimiser.adam, keyframes))
         self._find_views_here()
@@ -249,6 +250,7 @@ class Mapper:
         """Let these tiles be in memory again, where they are as they left."""
         if not keyframes:
             return
+        self.scene.go_on()
         whole, states = GaussianMap(), list[Arrays]()
         for keyframe in keyframes:
             with self.failures.contain("tile of the map"):

@@ -246,10 +246,9 @@ class Scene:
         """Place of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
         centres = np.stack([view.T_wc.t for view in views])
         z, which = KDTree(centres).query(map_out(self.gaussians.means))
-        found = (centres[which], z, which)
         return (
-            pose_in(found[0], self.device), pose_in(found[1], self.device),
-            rows_in(np.asarray(found[2], np.int64), self.device),
+            pose_in(centres[which], self.device), pose_in(np.asarray(z), self.device),
+            rows_in(np.asarray(which, np.int64), self.device),
         )  # fmt: skip
 
     @contextmanager

@@ -92,7 +92,7 @@ class SpatialIndex:
         many standard deviations."""
         reach, axes = sigmas * self._sigma[:, None], slice(len(low))
         met = (self._low[:, axes] <= high + reach) & (self._high[:, axes] >= low - reach)
-        return self._rows(met.all(axis=1))
+        return self._rows(np.asarray(met.all(axis=1)))
 
     def _rows(
         self,

@@ -258,7 +258,7 @@ class Tiles:
             return set(self.seen)
         tiles = [tile.sphere for tile in self.waiting.values()]
         apart, which = KDTree(np.stack([tile.centre for tile in tiles])).query(
-            [sphere.centre for sphere in self.seen.values()]
+            np.stack([sphere.centre for sphere in self.seen.values()])
         )
         radii = np.array([tile.radius for tile in tiles])[which]
         radii += [sphere.radius for sphere in self.seen.values()]

@@ -152,10 +152,9 @@ def packed_points(cloud: PointCloud) -> npt.NDArray[np.void]:
     step, first, packed = points_step(cloud), 0, [np.zeros(0, POINT)]
     for chunk in cloud.chunks():
         chosen = slice(-first % step, None, step)
-        positions, colours, sigma = (
-            each[chosen] for each in (chunk.positions, chunk.colours, chunk.sigma)
+        packed.append(
+            point_records(chunk.positions[chosen], chunk.colours[chosen], chunk.sigma[chosen])
         )
-        packed.append(point_records(positions, colours, sigma))
         first += len(chunk.positions)
     return np.concatenate(packed)
 

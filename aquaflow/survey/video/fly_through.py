@@ -111,9 +111,12 @@ class Clear:
         camera, blank = self._camera, np.zeros((1, 1, 3), np.uint8)
         view = View(-1, blank, camera, T_wc, 0, False, device=self._mapper.device)
         rows = self._mapper.scene.near(camera, T_wc)
+        means, wxyz, scales, opacities, colours = (
+            each if rows is None else each.index_select(0, rows) for each in self._splats
+        )
         drawn = self._mapper.renderer(
-            *(each if rows is None else each.index_select(0, rows) for each in self._splats),
-            view.viewmat(), view.K(), camera.width, camera.height,
+            means, wxyz, scales, opacities, colours, view.viewmat(), view.K(), camera.width,
+            camera.height,
         )  # fmt: skip
         return to_bytes(picture_out(drawn.image))
 

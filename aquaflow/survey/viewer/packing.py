@@ -79,7 +79,10 @@ class PackedCode:
 class MoreDetail(Protocol):
     """Tiles of a map of which the chunks are only what covers most (map_tiles.py)."""
 
-    code: PackedCode
+    @property
+    def code(self) -> PackedCode:
+        """Of the bytes of all parts."""
+        ...
 
     def description(self) -> dict[str, Any]:
         """What a browser needs to choose tiles and to read them."""
@@ -435,8 +438,9 @@ def write_packed(
             file.writestr(ABOUT, json.dumps(said))
             for number in range(len(about["ends"])):
                 file.writestr(str(number), packed.chunk(number) or b"")
-            for number, part in () if tiles is None else tiles.parts():
-                file.writestr(_name(number, part), tiles.part(number, part) or b"")
+            if tiles is not None:
+                for number, part in tiles.parts():
+                    file.writestr(_name(number, part), tiles.part(number, part) or b"")
     except InputError as error:
         log.info("the packed map is not kept: %s", error)
 

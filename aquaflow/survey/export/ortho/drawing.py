@@ -83,7 +83,8 @@ class GroundSplats:
         low, high = grid.bounds(tile)
         near = self._index.in_box(low - grid.pixel, high + grid.pixel, RADIUS_SIGMAS)
         places, reach = self._splats.means[near, :2], self._reach[near, None] + grid.pixel
-        return near[((places > low - reach) & (places < high + reach)).all(axis=1)]
+        touched = ((places > low - reach) & (places < high + reach)).all(axis=1)
+        return np.asarray(near[touched])
 
     @torch.no_grad()
     def draw(
