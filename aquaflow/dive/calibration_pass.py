@@ -31,8 +31,15 @@ from aquaflow.prior.contract import Keypoints
 from aquaflow.slam import Slam
 from aquaflow.sources import CameraSource
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.tracking.calibration_check import TOLERANCE, LensError, most_turning, view_of
-from aquaflow.tracking.frames import Tracked
+from aquaflow.tracking.calibration_check import (
+    MAX_VIEWS,
+    TOLERANCE,
+    LensError,
+    lens_error_of_frames,
+    most_turning,
+    view_of,
+)
+from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.overlay import OverlayFinder
 from aquaflow.tracking.self_calibration import MOST_VIEWS, FoundLens, LensViews, found_lens
 from aquaflow.types import Frame
@@ -325,6 +332,48 @@ def usable(camera: CameraModel) -> CameraModel | None:
     if not possible:
         log.warning("the lens that was found cannot be: %s", camera)
     return camera if possible else None
+
+
+# --------------------------------------------------------------------------------------------------
+# The frames of a dive that may end before it has keyframes enough for the calibration check.
+
+
+class EarlyViews:
+    """Views of the lens from the first frames of a dive with a calibration."""
+
+    def __init__(self, slam: Slam) -> None:
+        self._slam = slam
+        self._views: LensViews | None = None
+
+    def take(self, decided: Sequence[Tracked]) -> None:
+        """Frames that are finished; of a dive with keyframes enough none is kept."""
+        keyframes = self._slam.keyframes
+        if len(keyframes) >= MAX_VIEWS:
+            self._views = None
+            return
+        for tracked in decided:
+            # What repeats an earlier picture has a pose too, and no picture any more.
+            repeated = tracked.frame_class is FrameClass.SKIPPED
+            if repeated or tracked.T_wc is None or tracked.keyframe is None:
+                continue
+            frame = tracked.frame
+            self._views = self._views or LensViews(frame.camera)
+            rho = _nearness(keyframes[tracked.keyframe])
+            keypoints = partial(self._keypoints, frame)
+            self._views.offer(frame.index, tracked.T_wc, tracked.sub_map, rho, keypoints)
+            if self._views.full:
+                self._views.thin()
+
+    def lens_error(self) -> LensError | None:
+        """The error of the lens that they show; None if they are too few or show too little."""
+        if self._views is None:
+            return None
+        results = self._slam.results()
+        poses = {t.frame.index: t.T_wc for t in results if t.T_wc is not None}
+        return lens_error_of_frames(self._views.posed_views(poses))
+
+    def _keypoints(self, frame: Frame) -> Keypoints:
+        return self._slam.prior.encode(frame.image, frame.camera, frame.mask).keypoints
 
 
 # --------------------------------------------------------------------------------------------------

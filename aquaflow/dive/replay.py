@@ -14,7 +14,7 @@ from aquaflow.base.stages import Profiler, Stages
 from aquaflow.base.worker import usable_threads
 from aquaflow.config import Config, SourceConfig
 from aquaflow.config.stage import MountingConfig
-from aquaflow.dive.calibration_pass import found_in
+from aquaflow.dive.calibration_pass import EarlyViews, found_in
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.mapping.work import MIN_VIEWS
@@ -89,6 +89,8 @@ def map_recording(
             shown = progress or (lambda stage, done, total: None)
             if calibration is None:
                 _find_camera(run, recording, shown)
+            else:
+                run.early_views = EarlyViews(slam)
             finished = _replay(run, recording, given, playback, config, shown)
             folder.set_finished()
             return finished

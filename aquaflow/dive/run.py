@@ -18,7 +18,7 @@ from aquaflow.config import Config
 from aquaflow.config.mapping import InsertionConfig, OptimiserConfig
 from aquaflow.config.stage import StageConfig
 from aquaflow.dive import calibration_pass
-from aquaflow.dive.calibration_pass import FoundCamera, from_keyframes, in_words
+from aquaflow.dive.calibration_pass import EarlyViews, FoundCamera, from_keyframes, in_words
 from aquaflow.dive.deliverables import DeliverablePhase, Deliverables, deliverables_of
 from aquaflow.dive.fixes_csv import fix_numbers
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
@@ -92,6 +92,8 @@ class DiveRun:
         self.config = config
         self.lens_error: LensError | None = None
         """Result of the calibration check, if a calibration was given; known at the end."""
+        self.early_views: EarlyViews | None = None
+        """Of a replay with a calibration."""
         self.found: FoundCamera | None = None
         """The camera of a dive without calibration, as far as its own pictures show it."""
         self.sources: dict[str, str] = {}
@@ -212,6 +214,9 @@ class DiveRun:
         """Finished frames."""
         with self.profiler.stage("record"):
             self.folder.record(self._row(tracked) for tracked in decided)
+        if self.early_views is not None:
+            with self.slam.stages("calibration check"):
+                self.early_views.take(decided)
 
     def _row(self, tracked: Tracked) -> FrameRow:
         posed = tracked.T_wc is not None
@@ -393,6 +398,9 @@ class DiveRun:
             return
         with self.slam.stages("calibration check"):
             self.lens_error = lens_error(self.slam.keyframes.readable)
+            early = None if self.early_views is None else self.early_views.lens_error()
+            if not calibration_pass.can_tell(self.lens_error) and calibration_pass.can_tell(early):
+                self.lens_error = early
 
     def _shortcomings(self) -> list[str]:
         gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())

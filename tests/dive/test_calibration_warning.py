@@ -16,6 +16,7 @@ from aquaflow.dive import replay, run
 from aquaflow.geometry.camera import load_camera, save_camera
 from aquaflow.keyframes import Keyframe
 from aquaflow.sources import open_recording
+from aquaflow.tracking.calibration_check import MIN_VIEWS
 from tests.command_line import Cli
 
 TRACKING = Config.model_validate({"threads": 1, "mapping": {"enabled": False}})
@@ -65,15 +66,33 @@ def test_a_calibration_that_a_short_dive_cannot_judge_is_noted_and_named(
 ) -> None:
     recording = open_recording(small_recording)
     assert recording.camera is not None
-    save_camera(recording.camera.with_focal_scaled(2.0), tmp_path / "twice.yaml")
+    save_camera(recording.camera.with_focal_scaled(1.1), tmp_path / "longer.yaml")
     ran = aquaflow(
-        *("map", small_recording, "--calib", tmp_path / "twice.yaml", "--tracking-only", *how),
+        *("map", small_recording, "--calib", tmp_path / "longer.yaml", "--tracking-only", *how),
         *("--stop", 12, "--out", tmp_path / "dive"),
     )
     assert "camera.yaml" not in ran.out
     if not how:  # what the live loop takes of a recording depends on the machine
         assert "Note: whether the calibration fits could not be checked" in ran.out
         assert "Note: the calibration is the one that was given (--calib)." in ran.out
+
+
+def test_twice_the_focal_length_is_told_by_a_second_with_hardly_a_keyframe(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    recording = open_recording(small_recording)
+    assert recording.camera is not None
+    save_camera(recording.camera.with_focal_scaled(2.0), tmp_path / "twice.yaml")
+    ran = aquaflow(
+        *("map", small_recording, "--calib", tmp_path / "twice.yaml", "--tracking-only"),
+        *("--stop", 12, "--out", tmp_path / "dive"),
+    )
+    assert ran.code == 3, ran.err
+    assert ran.out.startswith("Warning: the calibration does not fit the dive")
+    numbers = json.loads((tmp_path / "dive" / "metrics.json").read_text())
+    assert numbers["keyframes"] < MIN_VIEWS
+    assert numbers["calibration_check"]["verdict"] == "wrong"
+    assert numbers["calibration_check"]["focal_px"] == pytest.approx(136.0, abs=30.0)
 
 
 def test_the_right_calibration_is_no_warning(small_dive: Path) -> None:
