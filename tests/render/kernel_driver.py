@@ -72,6 +72,8 @@ class Task:
             **{"rendered": (*image, 3), "range": image},
             **{"g_drawn": (*image, 4), "g_water_alpha": image, "g_water": (5, 3)},
             **{"loss": (1,), "g_rendered": (*image, 3), "stepped_means": (n, 3)},
+            **{"errors": (2, self.width), "H": (21, 21), "gradient": (21,)},
+            **{"gain": (self.width, 21), "offset": (self.width,), "scores": (self.width, 21)},
         }
         values = np.fromfile(path, np.float32)
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])

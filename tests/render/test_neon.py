@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
 import torch
 
+from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.render.native import build as native
 from aquaflow.render.photometric import photometric_loss_torch
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.water import compose_water_torch
+from aquaflow.tracking.adjustment.equations import AnchorMatches, equations_by_definition, project
 from tests.render.kernel_driver import Task, compile_driver, run_driver
 from tests.render.render_scenes import HEIGHT, NAMES, WIDTH, Scene, random_scene, relative_error
 
@@ -107,6 +110,43 @@ def test_neon_adam_makes_first_steps_of_the_learning_rate(
     assert seen.any()
     assert torch.allclose(step, -1e-3 * got["g_means"][seen].sign(), rtol=2e-3)
     assert torch.equal(got["stepped_means"][got["visible"] == 0], before[got["visible"] == 0])
+
+
+def anchored(scene: Scene, task: Task) -> tuple[AnchorMatches, Sim3Batch, np.ndarray]:
+    """The anchor, poses and inverse depths that ``adjust`` of kernel_driver.cpp makes."""
+    arrays = {key: task.arrays[key].reshape(-1, 3 if key == "target" else 1).astype(np.float64)
+              for key in ("target", "weight", "mask")}  # fmt: skip
+    points, index = task.width, np.arange(task.width)
+    flat, seen = arrays["target"][:points, :2], arrays["mask"][:points, 0] > 0.5
+    R = scene.viewmat[:3, :3].double().numpy()
+    rho = 0.5 + arrays["weight"][:points, 0]
+    matches = AnchorMatches(
+        anchor=0,
+        views=np.array([1, 2]),
+        rays=np.column_stack([flat - 0.5, np.ones(points)]),
+        rho=1.1 * rho,
+        variance=np.where(index % 7 == 0, np.inf, 0.04),
+        at=np.stack([flat - 0.4] * 2),
+        used=np.stack([seen, seen & (index % 3 != 0)]),
+        sigma=np.array([0.5, 0.25]),
+    )
+    steps = [Sim3(R, 0.1 * (1.0 + v + np.arange(3)), 1.0 + 0.1 * v) for v in range(2)]
+    return matches, Sim3Batch.of([Sim3.identity(), *(T.inverse() for T in steps)]), rho
+
+
+def test_neon_equations_of_an_adjustment_agree_with_their_definition(
+    on_arm: dict[str, dict[str, torch.Tensor]],
+) -> None:
+    scene = SCENES["four channels"]
+    got = {key: value.double().numpy() for key, value in on_arm["four channels"].items()}
+    matches, poses, rho = anchored(scene, Task(scene))
+    expected, scores = equations_by_definition(matches, poses, rho)
+    errors = np.linalg.norm(project(matches, poses, rho).error, axis=-1)
+    pairs = {"errors": errors, "scores": scores} | {
+        name: getattr(expected, name) for name in ("H", "gradient", "gain", "offset")
+    }
+    for name, wanted in pairs.items():
+        np.testing.assert_allclose(got[name], wanted, rtol=1e-4, atol=1e-5 * np.abs(wanted).max())
 
 
 def test_a_cross_compiler_builds_the_variants_of_its_target() -> None:

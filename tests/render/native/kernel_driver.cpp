@@ -295,6 +295,47 @@ static void match(const Scene& s, bool short_of_memory) {
   if (aq_pose_equations(&pose, &result, nullptr) != 0) std::exit(4);
 }
 
+// An anchor's points in two views that are turned and moved as the scene's camera is; outliers,
+// points that no view sees, and depths that are not known; test_neon.py makes the same numbers.
+static void adjust(const Scene& s, bool short_of_memory, std::FILE* result) {
+  const int views = 2, points = s.width, n = 7 * (1 + views);
+  std::vector<double> R, t, rays, rho, at, known, variance;
+  const std::vector<double> sigma{0.5, 0.25};
+  std::vector<uint8_t> used;
+  for (int v = 0; v < views; v++) {
+    for (int i = 0; i < 9; i++)
+      R.push_back((1.0 + 0.1 * v) * s[s.kViewmat][4 * (i / 3) + i % 3]);
+    for (int i = 0; i < 3; i++) t.push_back(0.1 * (1 + v + i));
+  }
+  for (int v = 0; v < views; v++) {
+    for (int p = 0; p < points; p++) {
+      used.push_back(s[s.kMask][p] > 0.5f && (v == 0 || p % 3 != 0));
+      for (int i = 0; i < 2; i++) at.push_back((double)s[s.kTarget][3 * p + i] - 0.4);
+    }
+  }
+  for (int p = 0; p < points; p++) {
+    for (int i = 0; i < 2; i++) rays.push_back((double)s[s.kTarget][3 * p + i] - 0.5);
+    rays.push_back(1.0);
+    rho.push_back(0.5 + (double)s[s.kWeight][p]);
+    known.push_back(1.1 * rho.back());
+    variance.push_back(p % 7 == 0 ? INFINITY : 0.04);
+  }
+  const AnchorProblem given{R.data(),  t.data(),    rays.data(),  rho.data(),
+                            at.data(), sigma.data(), used.data(), known.data(),
+                            variance.data(), views,  points,      1e-3,
+                            2.0,       1e-9};
+  std::vector<double> lengths(views * points), H(n * n), gradient(n), gain(points * n),
+      offset(points), scores(points * n);
+  const AnchorSums sums{H.data(), gradient.data(), gain.data(), offset.data(), scores.data()};
+  if (aq_anchor_errors(&given, lengths.data()) != 0) std::exit(4);
+  run(short_of_memory, [&] { return aq_anchor_equations(&given, &sums); });
+  for (const auto* values : {&lengths, &H, &gradient, &gain, &offset, &scores})
+    for (double value : *values) {
+      const float single = (float)value;
+      std::fwrite(&single, sizeof single, 1, result);
+    }
+}
+
 int main(int count, char** arguments) {
   const bool short_of_memory = count > 1 && std::string(arguments[1]) == "--out-of-memory";
   for (int i = short_of_memory ? 2 : 1; i + 1 < count; i += 2) {
@@ -303,6 +344,7 @@ int main(int count, char** arguments) {
     const Scene scene(arguments[i]);
     draw(scene, short_of_memory, result);
     match(scene, short_of_memory);
+    adjust(scene, short_of_memory, result);
     std::fclose(result);
   }
 }
