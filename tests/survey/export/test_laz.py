@@ -161,7 +161,8 @@ def test_each_point_has_the_nearest_camera_that_shows_it() -> None:
     found = nearest_cameras(points, views)
     unseen = 0
     for point, centre in zip(points, found, strict=True):
-        shows = [view for view in views if view.shows((point - view.T_uc.t) @ view.T_uc.R)]
+        local = [(point[None] - view.T_uc.t) @ view.T_uc.R for view in views]
+        shows = [view for view, at in zip(views, local, strict=True) if view.shows(at)[0]]
         unseen += not shows
         among = np.array([view.T_uc.t for view in shows or views])
         best = among[np.linalg.norm(among - point, axis=1).argmin()]
