@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import pytest
+from mcap.reader import make_reader
 
 from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.dive import read_dive
@@ -24,12 +25,13 @@ rasterio = pytest.importorskip("rasterio")
 laspy = pytest.importorskip("laspy")
 pye57 = pytest.importorskip("pye57")
 trimesh = pytest.importorskip("trimesh")
+decoder = pytest.importorskip("mcap_ros2.decoder")
 
 pytestmark = pytest.mark.ci
 
 Array = npt.NDArray[np.float64]
 
-FORMATS = "ortho,dem,laz,e57,ply,glb,nerfstudio"
+FORMATS = "ortho,dem,laz,e57,ply,glb,nerfstudio,mcap"
 SYNTHETIC = ("--scene", "survey", "--frames", 6, "--width", 160, "--height", 120)
 LARGEST_SHIFT_PX = 4
 """That is looked for, in both directions."""
@@ -171,6 +173,19 @@ def test_glb_lies_over_the_ortho_and_has_y_up(products: Products) -> None:
     length = int.from_bytes(raw[12:16], "little")
     axes = json.loads(raw[20 : 20 + length])["asset"]["extras"]["axes"]
     assert axes.startswith("x to the right, y up, -z ")
+
+
+def test_mcap_lies_over_the_ortho(products: Products) -> None:
+    with products.file("dive.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[decoder.DecoderFactory()])
+        [(_, _, _, cloud)] = reader.iter_decoded_messages(["/aquaflow/points"])
+    assert cloud.header.frame_id == "map"
+    kind = np.dtype([(field.name, "<f4") for field in cloud.fields])
+    points = np.frombuffer(bytes(cloud.data), kind)
+    packed = points["rgb"].view("<u4")
+    colours = np.column_stack([packed >> shift & 255 for shift in (16, 8, 0)])
+    places = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)
+    lies_over(products, places, colours)
 
 
 def test_cameras_are_where_the_trajectory_says(products: Products) -> None:
