@@ -17,7 +17,7 @@ from aquaflow.geometry.arrays import add_prefix
 from aquaflow.lab.bench.growth import benchmark as bm
 from aquaflow.lab.bench.growth import worker
 from aquaflow.lab.bench.growth.benchmark import COLUMNS, markdown
-from aquaflow.lab.bench.growth.job import GrowthJob
+from aquaflow.lab.bench.growth.job import ABOARD, GrowthJob
 from aquaflow.lab.bench.growth.worker import checkpoint_bytes, folder_bytes
 from aquaflow.live.checkpoint import tracking
 from aquaflow.mapping.maps import Maps
@@ -62,6 +62,25 @@ def test_surveys_run_from_the_shortest_on_each_once(tmp_path: Path) -> None:
 def test_a_survey_without_a_map_is_tracked_only(tmp_path: Path) -> None:
     (job,) = bm.jobs_of([100], 160, "balanced", True, tmp_path)
     assert not job.config().mapping.enabled
+
+
+def test_a_survey_of_the_hour_with_instruments_and_settings_is_a_job(tmp_path: Path) -> None:
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("mapping: {hold_out_every: 5}\n")
+    (job,) = bm.jobs_of([100], 160, "fast", False, tmp_path, "hour", "dvl", settings)
+    assert (job.scene, job.telemetry) == ("hour", "dvl")
+    config = GrowthJob.from_text(job.to_text()).config()
+    assert config.mapping.hold_out_every == 5
+    assert config.mapping.max_gaussians == 80_000
+    assert ABOARD["attitude"] == ("depth", "attitude")
+
+
+@pytest.mark.parametrize("option", ["--scene", "--telemetry"])
+def test_an_unknown_scene_or_instrument_is_refused(option: str, tmp_path: Path) -> None:
+    asked = ["lab", "bench", "growth", "--quick", option, "sonar", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, asked)
+    assert result.exit_code != 0
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_run_is_refused_before_anything_runs(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from aquaflow.lab.synthetic.streams import Instrument
 from aquaflow.lab.synthetic.survey import FPS, SurveyPictures
 from aquaflow.lab.synthetic.survey_plan import (
     HOUR_S,
@@ -176,5 +177,6 @@ def test_samples_come_by_arrival_at_their_rates_with_their_errors(hour: SurveyPi
 
 
 def test_instruments_that_are_not_aboard_say_nothing(hour: SurveyPictures) -> None:
-    samples = list(SurveyTelemetry(hour).samples(10.0, ("depth",)))
+    aboard: tuple[Instrument, ...] = ("depth",)
+    samples = list(SurveyTelemetry(hour).samples(10.0, aboard))
     assert {type(sample) for sample in samples} == {Depth}

@@ -20,6 +20,7 @@ from aquaflow.tracking.metric.measured import KeyframeMeasurements, World, world
 from aquaflow.tracking.metric.straightening import (
     Straightened,
     solve_with_worlds,
+    straighten,
     straighten_again,
 )
 from aquaflow.tracking.metric.world_frames import FEW_KEYFRAMES, WorldFrames
@@ -98,7 +99,7 @@ def line_of(count: int, components: int = 1) -> PoseGraph:
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Keyframes of each time that telemetry was asked."""
     counts: list[int] = []
-    whole = world_frames.straighten
+    whole = straighten
 
     def counting(snapshot: Snapshot, *others: Any) -> Straightened:
         counts.append(len(snapshot.nodes))
