@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -126,7 +128,7 @@ class SimilarKeyframe:
 
 
 @dataclass(frozen=True)
-class _Signature:
+class Signature:
     """The words of one keyframe and the signs of what it differs by from them."""
 
     words: Index
@@ -140,12 +142,12 @@ class Retrieval:
 
     def __init__(self, config: RetrievalConfig) -> None:
         self._config = config
-        self._vocabulary: _Vocabulary | None = None
+        self._vocabulary: Vocabulary | None = None
         self._numbers: list[int] = []
-        self._file = _InvertedFile(config.words)
-        self._latest: _Signature | None = None
+        self._file = InvertedFile(config.words)
+        self._latest: Signature | None = None
         self._consecutive: list[float] = []
-        self._known: tuple[HasKeypoints, _Signature] | None = None
+        self._known: tuple[HasKeypoints, Signature] | None = None
 
     def add(self, number: int, encoding: HasKeypoints) -> None:
         """Remember keyframe ``number``; one that shows nothing to recognise is left out."""
@@ -189,50 +191,70 @@ class Retrieval:
         usual = float(np.median(self._consecutive)) if self._consecutive else 0.0
         return max(self._config.min_similarity, self._config.neighbour_share * usual)
 
-    def _signature(self, encoding: HasKeypoints) -> _Signature | None:
+    def _signature(self, encoding: HasKeypoints) -> Signature | None:
         if self._known is not None and self._known[0] is encoding:
             return self._known[1]
         descriptors = take_root(encoding.keypoints.descriptors)
         if len(descriptors) < self._config.min_descriptors:
             return None
         if self._vocabulary is None:
-            self._vocabulary = _Vocabulary(descriptors, self._config.words)
+            self._vocabulary = Vocabulary.drawn(descriptors, self._config.words)
         signature = self._vocabulary.signature(descriptors)
         self._known = (encoding, signature)
         return signature
 
 
-class _Vocabulary:
+@dataclass(frozen=True)
+class Vocabulary:
     """Words and projections, fixed once drawn."""
 
-    def __init__(
-        self,
+    mean: Float
+    """[d] of descriptors."""
+    directions: Float
+    """[d, size] in which descriptors differ most."""
+    words: Float
+    """[words, size] along them."""
+    projection: Float
+    """[size, SIGNS]"""
+
+    @staticmethod
+    def drawn(
         descriptors: Float,  # [M, d] of the first keyframe
         words: int,
-    ) -> None:
+    ) -> Vocabulary:
+        """Words as such descriptors lie."""
         rng = np.random.default_rng(SEED)
-        self._mean = descriptors.mean(0)
         variance, directions = np.linalg.eigh(np.cov(descriptors.T.astype(np.float64)))
         size = min(DIMENSIONS, len(variance))
-        self._directions = directions[:, ::-1][:, :size].astype(np.float32)
         spread = np.sqrt(np.maximum(variance[::-1][:size], 0.0))
-        self._words = (rng.normal(size=(words, size)) * spread).astype(np.float32)
-        self._twice = 2.0 * self._words.T
-        self._offset = (self._words * self._words).sum(1)
-        self._projection = rng.normal(size=(size, SIGNS)).astype(np.float32)
+        return Vocabulary(
+            descriptors.mean(0),
+            directions[:, ::-1][:, :size].astype(np.float32),
+            (rng.normal(size=(words, size)) * spread).astype(np.float32),
+            rng.normal(size=(size, SIGNS)).astype(np.float32),
+        )
+
+    @cached_property
+    def _twice(self) -> Float:
+        return np.asarray(2.0 * self.words.T, np.float32)
+
+    @cached_property
+    def _offset(self) -> Float:
+        return np.asarray((self.words * self.words).sum(1), np.float32)
 
     def signature(
         self,
         descriptors: Float,  # [M, d]
-    ) -> _Signature:
-        x = (descriptors - self._mean) @ self._directions
+    ) -> Signature:
+        """The words of descriptors, and the signs of what they differ by from them."""
+        x: Float = np.asarray((descriptors - self.mean) @ self.directions, np.float32)
         starts = range(0, len(x), MATCHED_TOGETHER)
         nearest = np.concatenate([self._nearest(x[i : i + MATCHED_TOGETHER]) for i in starts])
         words, place = np.unique(nearest, return_inverse=True)
         rest = np.zeros((len(words), x.shape[1]), np.float32)
-        np.add.at(rest, place, x - self._words[nearest])
-        packed = np.packbits(rest @ self._projection > 0.0, axis=1)
-        return _Signature(words.astype(np.int64), packed.view(np.uint64)[:, 0])
+        np.add.at(rest, place, x - self.words[nearest])
+        packed = np.packbits(rest @ self.projection > 0.0, axis=1)
+        return Signature(words.astype(np.int64), packed.view(np.uint64)[:, 0])
 
     def _nearest(
         self,
@@ -244,7 +266,7 @@ class _Vocabulary:
         return np.asarray(np.argmax(nearness, axis=1), dtype=np.int64)
 
 
-class _InvertedFile:
+class InvertedFile:
     """For each word, which keyframes have it and with which signs."""
 
     def __init__(self, words: int) -> None:
@@ -253,22 +275,40 @@ class _InvertedFile:
         self._owners = [np.empty(SHORTEST_LIST, np.int32) for _ in range(words)]
         self._signs = [np.empty(SHORTEST_LIST, np.uint64) for _ in range(words)]
 
+    @classmethod
+    def of(cls, signatures: Sequence[Signature], words: int) -> InvertedFile:
+        """As after adding the signatures in turn."""
+        file = cls(words)
+        file._sizes = [len(each.words) for each in signatures]
+        if not signatures:
+            return file
+        found = np.concatenate([each.words for each in signatures])
+        order = np.argsort(found, kind="stable")
+        signs = np.concatenate([each.signs for each in signatures])[order]
+        owners = np.repeat(np.arange(len(signatures), dtype=np.int32), file._sizes)[order]
+        starts = np.searchsorted(found[order], np.arange(words + 1)).tolist()
+        for word, (start, end) in enumerate(pairwise(starts)):
+            if end > start:
+                file._owners[word], file._signs[word] = owners[start:end], signs[start:end]
+                file._lengths[word] = end - start
+        return file
+
     def __len__(self) -> int:
         return len(self._sizes)
 
-    def add(self, signature: _Signature) -> None:
+    def add(self, signature: Signature) -> None:
         """One keyframe more."""
         owner = len(self._sizes)
         self._sizes.append(len(signature.words))
         for word, signs in zip(signature.words.tolist(), signature.signs, strict=True):
             end = self._lengths[word]
             if end == len(self._owners[word]):
-                self._owners[word] = np.resize(self._owners[word], end + end // 2)
-                self._signs[word] = np.resize(self._signs[word], end + end // 2)
+                self._owners[word] = np.resize(self._owners[word], end + end // 2 + 1)
+                self._signs[word] = np.resize(self._signs[word], end + end // 2 + 1)
             self._owners[word][end], self._signs[word][end] = owner, signs
             self._lengths[word] = end + 1
 
-    def similarities(self, query: _Signature) -> npt.NDArray[np.float64]:
+    def similarities(self, query: Signature) -> npt.NDArray[np.float64]:
         """[keyframes] similarity of every keyframe to ``query``."""
         words = query.words.tolist()
         ends = np.cumsum([self._lengths[word] for word in words]).tolist()
@@ -285,7 +325,7 @@ class _InvertedFile:
         return votes / np.sqrt(np.array(self._sizes) * float(len(words)))
 
 
-def _similarity(a: _Signature, b: _Signature) -> float:
+def _similarity(a: Signature, b: Signature) -> float:
     """Of two signatures: 0 to 1."""
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     differing = np.bitwise_count(a.signs[in_a] ^ b.signs[in_b])

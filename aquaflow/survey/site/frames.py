@@ -80,23 +80,18 @@ def frame_of(stated: Mapping[str, Any], dives: Mapping[str, Path]) -> WorldFrame
     )
 
 
-def log_growth(before: Sequence[Sim3], after: Sequence[Sim3]) -> float:
+def log_growth(before: Sim3Batch, after: Sim3Batch) -> float:
     """Mean logarithm of how much poses were enlarged."""
-    return float(np.mean([np.log(b.scale / a.scale) for a, b in zip(before, after, strict=True)]))
+    return float(np.mean(np.log(after.scale / before.scale)))
 
 
-def scale(T: Sim3, factor: float) -> Sim3:
-    """A pose in a world whose lengths are ``factor`` times as long, about its origin."""
-    return Sim3(T.R, factor * T.t, factor * T.scale)
-
-
-def common_move(before: Sequence[Sim3], after: Sequence[Sim3]) -> tuple[Sim3, float]:
+def common_move(before: Sim3Batch, after: Sim3Batch) -> tuple[Sim3, float]:
     """The similarity nearest to what took each of ``before`` to ``after``, and how much the poses
     are bent: the root mean square distance, in the unit of ``after``, that it leaves."""
-    moves = Sim3Batch.of(after) @ Sim3Batch.of(before).inverse()
+    moves = after @ before.inverse()
     mean = moves[:1]
     for _ in range(3):  # converges quadratically, and all lie near to each other
         mean = mean @ Sim3Batch.exp((mean.inverse() @ moves).log().mean(axis=0)[None])
     move = mean.on_group().element(0)
-    left = [np.linalg.norm(move.apply(a.t) - b.t) for a, b in zip(before, after, strict=True)]
+    left = np.linalg.norm(move.apply(before.t) - after.t, axis=1)
     return move, float(np.sqrt(np.mean(np.square(left))))

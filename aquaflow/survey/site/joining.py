@@ -2,212 +2,167 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config import GraphConfig, RetrievalConfig, VerificationConfig
+from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
-from aquaflow.keyframes.place import KeyframePlace, PlacesFile
-from aquaflow.survey.site.joint_graph import LEAST_TRUST, JointGraph
+from aquaflow.survey.site.joint_graph import (
+    AGAINST_GRAPH,
+    AGAINST_OTHERS,
+    ALONE,
+    JOINT_LINK,
+    LEAST_TRUST,
+    USED,
+    JointGraph,
+)
+from aquaflow.survey.site.links import DiveLinks
 from aquaflow.tracking.graph.equations import Rows, poses_of
-from aquaflow.tracking.graph.loop_admission import Chains, gap_chi2
-from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information
-from aquaflow.tracking.loops import Retrieval, verify_keypoints
+from aquaflow.tracking.graph.loop_admission import Chains
+from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, solve
 
-Verdict = Literal["used", "alone", "contradicts the others", "contradicts the graph"]
+GROWN = 1.1
+"""Keyframes over those there were, at which all are optimised together again: what that costs grows
+with their number, and so costs each dive the same. Between, a dive that is added moves no other:
+the 31st to 34th over one reef would move them by 0.2 to 3 mm, at 1.6 m from the ground
+(notes/2026-11-sites.md#hundred)."""
 
-
-@dataclass(frozen=True)
-class JudgedLink:
-    """A link between keyframes of two dives, and what became of it."""
-
-    dive_a: int
-    dive_b: int
-    link: CrossLink
-    verdict: Verdict
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class _Placed:
-    """A link with its nodes and its edge from B's keyframe to A's."""
-
-    dives: tuple[int, int]
-    link: CrossLink
-    edge: Edge
+def links_of(joint: JointGraph, dive: str, links: DiveLinks) -> Rows:
+    """[n] JOINT_LINK: what looking up ``dive`` found in dives of the graph; fingerprints."""
+    number = {fingerprint: index for index, fingerprint in enumerate(joint.dives)}
+    own, there = number[dive], [number.get(each, -1) for each in links.among]
+    found = links.rows[np.array(there, int)[links.rows["dive"]] >= 0]
+    rows = np.zeros(len(found), JOINT_LINK)
+    for name in found.dtype.names or ():
+        if name != "dive":
+            rows[name] = found[name]
+    rows["node_a"] = [joint.node(there[row["dive"]], int(row["a"])) for row in found]
+    rows["node_b"] = [joint.node(own, int(row["b"])) for row in found]
+    rows["edge"], rows["verdict"] = -1, ALONE
+    return rows
 
 
 def join(
-    joint: JointGraph, found: Mapping[tuple[int, int], Sequence[CrossLink]]
-) -> list[JudgedLink]:
-    """Join the sub-maps that agreeing links connect, and optimise all keyframes together.
-
-    Args:
-        joint: changed in place.
-        found: links by the indices of the two dives, A's and B's.
-
-    Returns:
-        Every link with its verdict, in order.
-    """
-    pairs = _by_sub_maps(joint, found)
-    verdicts: dict[int, Verdict] = {}
-    agreeing: list[tuple[list[_Placed], list[_Placed]]] = []
-    for links in pairs.values():
-        kept, others = _compare(joint, links, verdicts)
-        if kept:
-            agreeing.append((kept, others))
-    # The best proved first: an edge that joins two components is tested by nothing else.
-    agreeing.sort(key=lambda pair: -len(pair[0]))
-    added: list[_Placed] = []
-    for kept, _ in agreeing:
-        added += _add(joint, sorted(kept, key=lambda placed: -placed.link.inliers))
-    for _, others in agreeing:
-        added += _add(joint, others)
-    before = len(joint.graph.tables()["edges"]) - len(added)
-    joint.graph.optimise(everything=True)
-    trust = joint.graph.tables()["trust"]["trust"][before:]
-    for placed, how in zip(added, trust, strict=True):
-        verdicts[id(placed.link)] = "used" if how >= LEAST_TRUST else "contradicts the graph"
-    return [
-        JudgedLink(*dives, link, verdicts.get(id(link), "alone"))
-        for dives, links in found.items()
-        for link in links
-    ]
+    joint: JointGraph,
+    links: Rows,  # [n] JOINT_LINK
+) -> None:
+    """Join the components that agreeing links connect, those of earlier dives that nothing agreed
+    with among them, and optimise what that moves."""
+    joint.links = np.concatenate([joint.links, links])
+    components = len(joint.components())
+    while True:
+        # The best proved first: an edge that joins two components is tested by nothing else.
+        found = [_compare(joint, numbers) for numbers in _between_components(joint)]
+        best = max(found, key=lambda each: len(each.kept), default=_Comparison())
+        if not len(best.kept):
+            break
+        _add(joint, best.kept)
+        joint.links["verdict"][best.against] = AGAINST_OTHERS
+    _add(joint, _open(joint)[0])
+    _optimise(joint, whole=len(joint.components()) < components - 1)
+    judged = joint.links["edge"] >= 0
+    trust = joint.graph.tables()["trust"]["trust"][joint.links["edge"][judged]]
+    joint.links["verdict"][judged] = np.where(trust >= LEAST_TRUST, USED, AGAINST_GRAPH)
+    joint.settle_worlds()
+    joint.show()
 
 
-def _by_sub_maps(
-    joint: JointGraph, found: Mapping[tuple[int, int], Sequence[CrossLink]]
-) -> dict[tuple[int, int], list[_Placed]]:
-    """Links by the indices of the sub-maps that they connect."""
-    pairs = defaultdict[tuple[int, int], list[_Placed]](list)
-    for dives, links in found.items():
-        for link in links:
-            a, b = joint.node(dives[0], link.a), joint.node(dives[1], link.b)
-            edge = Edge(b, a, link.T_ba, link.information, loop=True)
-            between = (joint.sub_map_of(a), joint.sub_map_of(b))
-            pairs[between].append(_Placed(dives, link, edge))
-    return pairs
+def _optimise(joint: JointGraph, whole: bool) -> None:
+    """Move the last dive to where its links say; and all others, if ``whole`` or if the site has
+    grown by ``GROWN`` since that was done last."""
+    snapshot = joint.graph.snapshot()
+    nodes, edges = snapshot.nodes, len(snapshot.edges)
+    if whole or len(nodes) >= GROWN * joint.settled_nodes:
+        snapshot = replace(snapshot, settled=joint.settled_edges)
+        joint.settled_nodes, joint.settled_edges = len(nodes), edges
+    else:
+        first = joint.first_node_of(len(joint.dives) - 1)
+        fixed = nodes.copy()
+        fixed["component"][:first] = fixed["number"][:first]  # each stays: it is its own world
+        snapshot = replace(snapshot, nodes=fixed)
+    joint.graph.apply(solve(snapshot))
 
 
-def _compare(
-    joint: JointGraph, links: list[_Placed], verdicts: dict[int, Verdict]
-) -> tuple[list[_Placed], list[_Placed]]:
-    """Those that agree, and those that were not compared, of the links of two sub-maps."""
-    order = sorted(links, key=lambda placed: -placed.link.inliers)
-    compared, others = order[:MOST_COMPARED], order[MOST_COMPARED:]
-    # The edges as rows of a graph, without joining anything.
-    graph = joint.graph
-    tables = graph.tables()
-    probe = PoseGraph.of_tables(tables, graph.config)
-    compared = [placed for placed in compared if probe.add_edge(placed.edge)]
-    rows = probe.tables()["edges"][len(tables["edges"]) :]
-    poses = poses_of(tables["nodes"])
-    chains = Chains(poses, tables["edges"], np.flatnonzero(tables["trust"]["trust"] > 0.0))
-    strength = [float(placed.link.inliers) for placed in compared]
-    verdict = agreement(compatible_links(poses, chains, rows, graph.config), strength)
-    of_others: Verdict = "contradicts the others" if verdict.kept else "alone"
-    for index in verdict.against:
-        verdicts[id(compared[index].link)] = of_others
-    if not verdict.kept:
-        verdicts.update((id(placed.link), "alone") for placed in others)
-        return [], []
-    return [compared[index] for index in verdict.kept], others
+def _open(joint: JointGraph) -> tuple[Index, Index]:
+    """Links that have no verdict yet: those within a component, and those between two."""
+    links, component = joint.links, joint.graph.tables()["nodes"]["component"]
+    left = np.flatnonzero((links["verdict"] == ALONE) & (links["edge"] < 0))
+    within = component[links["node_a"][left]] == component[links["node_b"][left]]
+    return left[within], left[~within]
 
 
-def _add(joint: JointGraph, links: list[_Placed]) -> list[_Placed]:
-    return [placed for placed in links if joint.graph.add_edge(placed.edge)]
+def _between_components(joint: JointGraph) -> list[Index]:
+    """The links that join two components, for each pair that enough of them join."""
+    between, component = _open(joint)[1], joint.graph.tables()["nodes"]["component"]
+    ends = [component[joint.links[name][between]] for name in ("node_a", "node_b")]
+    pairs, of = np.unique(np.sort(np.array(ends).T, axis=1), axis=0, return_inverse=True)
+    groups = [between[of.ravel() == pair] for pair in range(len(pairs))]
+    return [numbers for numbers in groups if len(numbers) >= LEAST_AGREEING]
 
 
-# --------------------------------------------------------------------------------------------------
-# Places of one dive that another dive shows too: retrieved by words, proved by geometry.
+def _add(joint: JointGraph, numbers: Index) -> None:
+    """Add links to the graph, those of the most keypoints first."""
+    for number in _by_inliers(joint, numbers):
+        if joint.graph.add_edge(_edge(joint.links[number])):
+            joint.links["edge"][number] = len(joint.graph.tables()["edges"]) - 1
 
-Array = npt.NDArray[np.float64]
 
-RETRIEVAL = RetrievalConfig(neighbour_share=0.0, min_similarity=0.01, candidates=5)
-"""A place in another dive, seen in other water and light, is less like itself than neighbours on a
-path are: the true pairs of the reef clip's halves have similarities from 0.02. So only what chance
-gives is asked for, more candidates are tried, and verification decides."""
-SCALE_SIGMA = 0.05
-"""Relative scale that a link may be wrong by, beside its own covariance. The depths of two dives
-differ by what each dive's start left wrong: against structure from motion, the scales of the links
-of two dives are 0.3 to 2.2 % off on the reef and Curasao clips, and those of one pair of dives all
-to one side. A dozen links do not average that out: 1.5 % times the root of 12. What the cameras
-moved, seen in both dives, says more of the scale (notes/2026-11-sites.md#merge)."""
-ROTATION_SIGMA = 5e-4
-"""rad, likewise: the rotations of links of the same dives differ by 0.1 to 0.3 degrees, with a
-stated 0.01 to 0.05."""
-VERIFICATION = VerificationConfig()
-"""As within a dive."""
+def _by_inliers(joint: JointGraph, numbers: Index) -> Index:
+    return np.asarray(numbers[np.argsort(-joint.links["inliers"][numbers], kind="stable")])
+
+
+def _edge(link: Rows) -> Edge:  # [] JOINT_LINK
+    T_ba = Sim3(link["R"].copy(), link["t"].copy(), float(link["scale"]))
+    return Edge(int(link["node_b"]), int(link["node_a"]), T_ba, link["information"], loop=True)
+
+
+def _turned(edge: Edge) -> Edge:
+    """The same measurement from the other end."""
+    back = Sim3Batch.of([edge.T_ab.inverse()]).adjoint()[0]
+    return Edge(edge.b, edge.a, edge.T_ab.inverse(), back.T @ edge.information @ back, loop=True)
 
 
 @dataclass(frozen=True)
-class CrossLink:
-    """A keyframe of dive B that shows a place of a keyframe of dive A."""
+class _Comparison:
+    """What comparing the links between two components found, by their numbers."""
 
-    a: int
-    """Keyframe number in A."""
-    b: int
-    """Keyframe number in B."""
-    T_ba: Sim3
-    """A's keyframe to B's, in the units of both."""
-    information: Array
-    """[7, 7] of its right tangent."""
-    inliers: int
-    matched: int
-    cells: int
-    """As in :class:`aquaflow.tracking.loops.Verified`."""
-    similarity: float
-    """By the words of the two pictures."""
+    kept: Index = field(default_factory=lambda: np.zeros(0, np.intp))
+    against: Index = field(default_factory=lambda: np.zeros(0, np.intp))
 
 
-def find_links(
-    a: PlacesFile, b: PlacesFile, progress: Callable[[int, int], None] = lambda *_: None
-) -> list[CrossLink]:
-    """All pairs of keyframes that prove to show one place, ordered by B's and A's numbers.
-
-    Each is proved from its own keypoints alone; whether they agree with each other is not asked
-    here. The same files give the same links.
-
-    Raises:
-        InputError: a file is damaged.
-    """
-    retrieval = Retrieval(RETRIEVAL)
-    for place in a.places:
-        retrieval.add(place.number, a.keypoints(place.number))
-    links: list[CrossLink] = []
-    for done, place in enumerate(b.places):
-        links += _of_keyframe(a, retrieval, b, place)
-        progress(done + 1, len(b.places))
-    return sorted(links, key=lambda link: (link.b, link.a))
-
-
-def _of_keyframe(
-    a: PlacesFile, retrieval: Retrieval, b: PlacesFile, place: KeyframePlace
-) -> Iterator[CrossLink]:
-    own = b.keypoints(place.number)
-    for candidate in retrieval.candidates(own, exclude=lambda _: False):
-        past = a.keypoints(candidate.number)
-        proof = verify_keypoints(past, own.keypoints, own.camera, VERIFICATION, own)
-        if proof is None:
-            continue
-        T_ba, covariance = proof.estimate.T, proof.estimate.covariance
-        sigma = float(np.hypot(np.sqrt(covariance[6, 6]), SCALE_SIGMA))
-        pose = covariance[:6, :6] + np.diag([0.0, 0.0, 0.0, *[ROTATION_SIGMA**2] * 3])
-        information = edge_information(pose, sigma, T_ba)
-        yield CrossLink(
-            candidate.number, place.number, T_ba, information, proof.inliers, proof.matched,
-            proof.cells, candidate.similarity,
-        )  # fmt: skip
+def _compare(joint: JointGraph, numbers: Index) -> _Comparison:
+    """Which of the links between two components agree with each other."""
+    graph, compared = joint.graph, _by_inliers(joint, numbers)[:MOST_COMPARED]
+    tables = graph.tables()
+    component = tables["nodes"]["component"]
+    # All from one component to the other, as rows of a graph that nothing else joins.
+    edges = [_edge(joint.links[number]) for number in compared]
+    first = component[edges[0].a]
+    edges = [edge if component[edge.a] == first else _turned(edge) for edge in edges]
+    alone = {name: rows if name == "nodes" else rows[:0] for name, rows in tables.items()}
+    probe = PoseGraph.of_tables(alone, graph.config)
+    compared = compared[[probe.add_edge(edge) for edge in edges]]
+    rows, poses = probe.tables()["edges"], poses_of(tables["nodes"])
+    chains = Chains(poses, tables["edges"], np.flatnonzero(tables["trust"]["trust"] > 0.0))
+    strength = joint.links["inliers"][compared].astype(float).tolist()
+    verdict = agreement(compatible_links(poses, chains, rows, graph.config), strength)
+    if not verdict.kept:
+        return _Comparison()
+    return _Comparison(compared[list(verdict.kept)], compared[list(verdict.against)])
 
 
 # --------------------------------------------------------------------------------------------------
-# Which links of two sub-maps agree on how these lie to each other.
+# Which links of two components agree on how these lie to each other.
 #
-# Each link alone says where one sub-map lies in the other. Two links are compared over the chains
+# Each link alone says where one component lies in the other. Two links are compared over the chains
 # of keyframes between their ends: what is left over must be explained by the links' covariances and
 # the chains'. The largest set in which all agree with all is kept (pairwise consistent
 # measurements: Mangelson et al., ICRA 2018), found greedily from each link in turn.
@@ -215,18 +170,18 @@ def _of_keyframe(
 Mask = npt.NDArray[np.bool_]
 
 LEAST_AGREEING = 2
-"""Links that must agree before two sub-maps are joined: one alone is believed by nothing else."""
+"""Links that must agree before two components are joined: one alone is believed by nothing else."""
 MOST_COMPARED = 64
-"""Links of two sub-maps that are compared with each other: those of the most keypoints. The time
+"""Links of two components that are compared with each other: those of the most keypoints. The time
 grows with the square; the optimisation tests the others."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """The verdict on the links between two sub-maps."""
+    """The verdict on the links between two components."""
 
     kept: tuple[int, ...]
-    """Indices of those that agree, in order; empty where the sub-maps are not joined."""
+    """Indices of those that agree, in order; empty where they are not joined."""
     against: tuple[int, ...]
     """Indices of those that contradict the kept ones."""
 
@@ -272,23 +227,38 @@ def compatible_links(
     links: Rows,  # [n] EDGE
     config: GraphConfig,
 ) -> Mask:
-    """[n, n] which links agree with which; ``poses`` may have each sub-map in a world of its own.
+    """[n, n] which links agree with which; ``poses`` may have each component in a world of its own.
 
     A pair of links from one pair of keyframes is one measurement made twice, and is no agreement.
     """
-    count = len(links)
-    found = np.zeros((count, count), dtype=bool)
-    at, seen, measured = poses[links["a"]], poses[links["b"]], poses_of(links)
-    for i in range(count):
-        # Both sides in the world of a, as link i has it.
-        own = slice(i, i + 1)
-        to_a = at[own] @ measured[own] @ seen[own].inverse()
-        for j in range(i):
-            both = np.array([j, i])
-            pair = links[both]
-            if (pair[0]["a"], pair[0]["b"]) == (pair[1]["a"], pair[1]["b"]):
-                continue
-            moved = Sim3Batch(*(np.repeat(part, 2, 0) for part in (to_a.R, to_a.t, to_a.scale)))
-            gap = gap_chi2(pair, at[both], moved @ seen[both], chains, config)
-            found[i, j] = found[j, i] = gap <= config.loop_chi2
+    found = np.zeros((len(links), len(links)), dtype=bool)
+    i, j = np.tril_indices(len(links), -1)
+    other = (links["a"][i] != links["a"][j]) | (links["b"][i] != links["b"][j])
+    i, j = i[other], j[other]
+    if not len(i):
+        return found
+    measured = poses_of(links)
+    claimed, seen = poses[links["a"]] @ measured, poses[links["b"]]
+    T_ji = seen[j].inverse() @ seen[i]
+    gap = (claimed[i].inverse() @ (claimed[j] @ T_ji)).log()
+    back, ahead = T_ji.inverse().adjoint(), measured[i].inverse().adjoint()
+    covariance = cache(lambda start, end: chains.covariance(chains.path(start, end)))
+    at_a, at_b = (
+        np.stack(
+            [covariance(*ends) for ends in zip(*links[end][np.stack([j, i])].tolist(), strict=True)]
+        )
+        for end in ("a", "b")
+    )
+    own = links["covariance"][i] + _carried(back, links["covariance"][j])
+    whole = own + config.drift_factor**2 * (at_b + _carried(ahead, at_a))
+    chi2 = np.einsum("ni,ni->n", gap, np.linalg.solve(whole, gap[:, :, None])[:, :, 0])
+    found[i, j] = found[j, i] = chi2 <= config.loop_chi2
     return found
+
+
+def _carried(
+    adjoint: Array,  # [k, 7, 7]
+    covariance: Array,  # [k, 7, 7]
+) -> Array:
+    """[k, 7, 7] the covariances seen from elsewhere."""
+    return np.asarray(adjoint @ covariance @ adjoint.transpose(0, 2, 1))

@@ -56,6 +56,49 @@ def fingerprint(dive: Path) -> str:
     return found.hexdigest()
 
 
+STAMPS = "stamps.json"
+"""In a site's folder."""
+Stamp = list[list[int]]
+"""Of each file of ``FINGERPRINTED``: bytes, time of the last change in ns, inode; empty where it is
+not there."""
+
+
+def read_stamps(site: Path) -> dict[str, Stamp]:
+    """What the files of a dive's folder looked like when they had the fingerprint; a dive whose
+    files still look so is not read again."""
+    try:
+        return dict(read_regular_json(site / STAMPS))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def write_stamps(site: Path, stamps: dict[str, Stamp]) -> None:
+    """Write them into the site's folder.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    write_json(site / STAMPS, stamps)
+
+
+def stamp_of(dive: Path) -> Stamp:
+    """What the files of the folder ``dive`` look like.
+
+    Raises:
+        InputError: a file is there and cannot be looked at.
+    """
+    found: Stamp = []
+    for name in FINGERPRINTED:
+        try:
+            state = (dive / name).stat()
+            found.append([state.st_size, state.st_mtime_ns, state.st_ino])
+        except FileNotFoundError:
+            found.append([])
+        except OSError as error:
+            raise InputError(f"cannot read {dive / name}: {error.strerror}; check it") from error
+    return found
+
+
 def check_unchanged(dive: Path, before: str) -> None:
     """Compare the folder ``dive`` with the fingerprint that it was merged with.
 
@@ -108,12 +151,14 @@ def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
         InputError: a folder is no finished dive, or the site cannot be read or written.
     """
     there = list(read_site(site)) if (site / NAME).exists() else []
-    new = []
+    new, stamps = [], read_stamps(site)
     for folder in folders:
         read = Dive(folder)
         read.require()
         _ = read.places  # refuses what cannot be recognised again
+        stamp = stamp_of(folder)
         mark = fingerprint(folder)
+        stamps[mark] = stamp
         at = next((i for i, dive in enumerate(there) if _same(dive.folder(site), folder)), None)
         if at is None:
             names = {dive.name for dive in there}
@@ -126,11 +171,14 @@ def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
             new.append(there[at])
     _make(site)
     write_json(site / NAME, {"format": FORMAT, "dives": [asdict(dive) for dive in there]})
+    marks = {dive.fingerprint for dive in there}
+    write_stamps(site, {mark: stamp for mark, stamp in stamps.items() if mark in marks})
     return new
 
 
-def state_of(site: Path, dive: SiteDive) -> str:
-    """ "as added", "changed" or "missing".
+def state_of(site: Path, dive: SiteDive, stamps: dict[str, Stamp] | None = None) -> str:
+    """ "as added", "changed" or "missing"; of what is in ``stamps`` nothing is read, what is read
+    and is as added gets there.
 
     Raises:
         InputError: a file of it is there and cannot be read.
@@ -138,7 +186,14 @@ def state_of(site: Path, dive: SiteDive) -> str:
     folder = dive.folder(site)
     if not (folder / PLACES).is_file():
         return "missing"
-    return "as added" if fingerprint(folder) == dive.fingerprint else "changed"
+    stamp = stamp_of(folder)
+    if stamps is not None and stamps.get(dive.fingerprint) == stamp:
+        return "as added"
+    if fingerprint(folder) != dive.fingerprint:
+        return "changed"
+    if stamps is not None:
+        stamps[dive.fingerprint] = stamp
+    return "as added"
 
 
 def _same(a: Path, b: Path) -> bool:

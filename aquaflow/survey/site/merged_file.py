@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.archive import read_array_file
-from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.arrays import sim3_from_json, sim3_to_json
 from aquaflow.geometry.similarity import Sim3
@@ -81,6 +84,31 @@ class MergedSite:
         """The sub-maps of a dive."""
         return tuple(each for each in self.sub_maps if each.dive == name)
 
+    @cached_property
+    def _rows(self) -> dict[tuple[str, int], slice]:
+        """Where the keyframes of a dive's sub-map stand: they follow each other."""
+        names, rows = list(self.fingerprints), self.keyframes
+        ends = np.flatnonzero(np.diff(rows["dive"]) | np.diff(rows["sub_map"])) + 1
+        bounds = [0, *ends.tolist(), len(rows)] if len(rows) else []
+        firsts = [(int(rows[first]["dive"]), int(rows[first]["sub_map"])) for first in bounds[:-1]]
+        return {
+            (names[dive], sub_map): slice(*own)
+            for (dive, sub_map), own in zip(firsts, pairwise(bounds), strict=True)
+        }
+
+    def rows_of(self, dive: str, sub_map: int) -> Rows:
+        """[K] KEYFRAME: the keyframes of a sub-map; none of one that was not merged."""
+        return np.asarray(self.keyframes[self._rows.get((dive, sub_map), slice(0, 0))])
+
+    def has_as(self, other: MergedSite, dive: str, sub_map: int) -> bool:
+        """True if a sub-map lies here as in another merge of the same dive."""
+        here, there = (
+            [each.rows_of(dive, sub_map)[name] for name in KEYFRAME.names or () if name != "dive"]
+            for each in (self, other)
+        )
+        same = all(np.array_equal(a, b) for a, b in zip(here, there, strict=True))
+        return same and self.fingerprints.get(dive) == other.fingerprints.get(dive)
+
     def choose(self, component: int | None, site: Path) -> int:
         """The component that was asked for; None: the one with most keyframes.
 
@@ -131,14 +159,18 @@ def write_merged(site: Path, merged: MergedSite) -> None:
         asdict(each) | {"T_sm": sim3_to_json(each.T_sm), "T_sn": sim3_to_json(each.T_sn)}
         for each in merged.sub_maps
     ]
-    write_json(
-        site / NAME,
-        {
-            "format": FORMAT, "dives": dict(merged.fingerprints),
-            "left_out": dict(merged.left_out), "components": list(merged.components),
-            "sub_maps": sub_maps, "links": list(merged.links),
-        },
-    )  # fmt: skip
+    stated = {
+        "format": FORMAT, "dives": dict(merged.fingerprints), "left_out": dict(merged.left_out),
+    }  # fmt: skip
+    text = json.dumps(stated, indent=2, allow_nan=False).removesuffix("\n}")
+    for name, rows in (
+        ("components", merged.components), ("sub_maps", sub_maps), ("links", merged.links),
+    ):  # fmt: skip
+        # Each a line: without indentation Python's encoder is compiled, and takes a tenth.
+        lines = ",".join(f"\n    {json.dumps(each, allow_nan=False)}" for each in rows)
+        text += f',\n  "{name}": [{lines}\n  ]'
+    with atomic_write(site / NAME) as stream:
+        stream.write(f"{text}\n}}\n".encode())
 
 
 def read_merged(site: Path) -> MergedSite | None:

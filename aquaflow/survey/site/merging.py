@@ -1,34 +1,47 @@
 """``aquaflow site merge``: the dives of a site recognised in each other and optimised together.
 
-Links of a pair of dives are kept on disk as soon as they are found: a merge that was cut off goes
-on with the next pair, and a dive added later is compared with the others alone. The rest takes
-seconds, is done anew each time, and gives the same bytes for the same dives.
+Dives join one after the other. A dive is looked up in all that joined before it, and what that
+found is kept on disk, as is the joint graph: a merge that was cut off goes on with the next dive,
+and a dive that was added later costs its own look-up, and moves what it touches. Where a dive is
+gone or changed, the graph is built anew of the kept links.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from itertools import combinations
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.errors.regular_file import read_regular_json
-from aquaflow.base.storage.atomic import make_subfolder, open_to_append, write_json
+from aquaflow.base.storage.atomic import open_to_append
 from aquaflow.base.storage.whole_folder import FolderLock
 from aquaflow.dive.dive import Dive
-from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import PlacesFile
-from aquaflow.survey.site.joining import CrossLink, find_links, join
-from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_of
-from aquaflow.survey.site.manifest import NAME, SiteDive, add_dives, read_site, state_of
-from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_merged
+from aquaflow.survey.site.joining import join, links_of
+from aquaflow.survey.site.joint_graph import JointGraph, read_joint, write_joint
+from aquaflow.survey.site.links import LINK, DiveLinks, find_links, read_links, write_links
+from aquaflow.survey.site.manifest import (
+    NAME,
+    SiteDive,
+    add_dives,
+    read_site,
+    read_stamps,
+    state_of,
+    write_stamps,
+)
+from aquaflow.survey.site.merged_file import (
+    MergedSite,
+    read_merged,
+    remove_merged,
+    write_merged,
+)
+from aquaflow.survey.site.place_index import PlaceIndex, read_index
 from aquaflow.survey.site.placing import place
 from aquaflow.survey.site.site_paths import write_paths
 from aquaflow.telemetry.world_frame import WorldFrame
@@ -38,12 +51,16 @@ Progress = Callable[[str, int, int | None], None]
 
 @dataclass(frozen=True)
 class Taking:
-    """A dive that takes part in a merge."""
+    """A dive that takes part in a merge; its files are read when they are needed."""
 
     dive: SiteDive
     folder: Path
-    places: PlacesFile
     frames: dict[int, WorldFrame]
+
+    @cached_property
+    def places(self) -> PlacesFile:
+        """Its keyframes."""
+        return Dive(self.folder).places
 
 
 def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:
@@ -58,11 +75,18 @@ def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:
     dives = read_site(site)
     lock = FolderLock(site)
     try:
+        before = _before(site)
         taking, left_out = _taking(site, dives)
-        found = _links(site, taking, progress)
-        merged = _merge(taking, left_out, found)
+        joint = read_joint(site, {dive: each.frames for dive, each in taking.items()})
+        joint = joint or JointGraph()
+        if taking.keys() - joint.dives:
+            _join(site, taking, joint, left_out, progress)
+            write_joint(site, joint)
+        names = {dive: each.dive.name for dive, each in taking.items()}
+        merged = place(joint, names, left_out, before)
         remove_merged(site)
-        write_paths(site, {each.dive.name: each.folder for each in taking}, merged)
+        folders = {each.dive.name: each.folder for each in taking.values()}
+        write_paths(site, folders, merged, before)
         write_merged(site, merged)
         say(site, "merged", dives=len(taking), components=len(merged.components))
     finally:
@@ -70,23 +94,41 @@ def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:
     return merged
 
 
-def _taking(site: Path, dives: Sequence[SiteDive]) -> tuple[list[Taking], dict[str, str]]:
-    taking, left_out = [], {}
+def _before(site: Path) -> MergedSite | None:
+    """The last merge; None where there is none that can be read."""
+    try:
+        return read_merged(site)
+    except InputError:
+        return None
+
+
+def _taking(site: Path, dives: Sequence[SiteDive]) -> tuple[dict[str, Taking], dict[str, str]]:
+    """The dives that can be merged, by fingerprint, and why the others cannot, by name."""
+    taking: dict[str, Taking] = {}
+    left_out, stamps = {}, read_stamps(site)
+    known = dict(stamps)
     for dive in dives:
         folder = dive.folder(site)
         try:
-            state = state_of(site, dive)
+            state = state_of(site, dive, stamps)
             if state != "as added":
                 left_out[dive.name] = _WHY[state]
-                continue
-            read = Dive(folder)
-            taking.append(Taking(dive, folder, read.places, dict(read.metric_frames)))
+            elif dive.fingerprint in taking:
+                left_out[dive.name] = f"it is a copy of {taking[dive.fingerprint].dive.name}"
+            else:
+                taking[dive.fingerprint] = Taking(dive, folder, dict(Dive(folder).metric_frames))
         except InputError as error:
             left_out[dive.name] = str(error)
+    if stamps != known:
+        write_stamps(site, stamps)
+    _require(site, taking, left_out)
+    return taking, left_out
+
+
+def _require(site: Path, taking: Mapping[str, Taking], left_out: Mapping[str, str]) -> None:
     if not taking:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
         raise InputError(f"{site} has no dive that can be merged ({why or 'it is empty'})")
-    return taking, left_out
 
 
 _WHY = {
@@ -95,104 +137,76 @@ _WHY = {
 }
 
 
-def _links(
-    site: Path, taking: Sequence[Taking], progress: Progress
-) -> dict[tuple[int, int], list[CrossLink]]:
-    found = {}
-    for i, j in combinations(range(len(taking)), 2):
-        a, b = taking[i], taking[j]
-        path = link_file(site, a.dive, b.dive)
-        links = read_links(path, a.dive, b.dive)
-        if links is None:
-            stage = f"{a.dive.name} - {b.dive.name}"
+def _join(
+    site: Path,
+    taking: dict[str, Taking],
+    joint: JointGraph,
+    left_out: dict[str, str],
+    progress: Progress,
+) -> None:
+    """Add the dives that are not in the joint graph yet: those that were looked up before first."""
+    index = _index(site, taking, left_out)
+    known = {dive: read_links(site, dive) for dive in taking if dive not in joint.dives}
+    for dive in sorted(known, key=lambda each: known[each] is None):
+        if dive not in taking:
+            continue
+        links = known[dive] or DiveLinks((), np.zeros(0, LINK))
+        others = _links_from(site, joint.dives, dive, links) if known[dive] else []
+        covered = {*links.among, *(each for each, _ in others)}
+        among = [each for each in joint.dives if each not in covered]
+        if among or known[dive] is None:
+            links += _look_up(site, taking, index, dive, among, progress)
+            write_links(site, dive, links)
+        joint.add(dive, taking[dive].places, taking[dive].frames)
+        rows = [links_of(joint, dive, links), *(links_of(joint, *each) for each in others)]
+        join(joint, np.concatenate(rows))
 
-            def advance(done: int, total: int, stage: str = stage) -> None:
-                progress(stage, done, total)
 
-            links = find_links(a.places, b.places, advance)
-            write_links(path, a.dive, b.dive, links)
-            say(site, "compared", a=a.dive.name, b=b.dive.name, links=len(links))
-        found[i, j] = links
+def _index(site: Path, taking: dict[str, Taking], left_out: dict[str, str]) -> PlaceIndex:
+    """The index of all dives; one that does not fit into it is left out."""
+    index = read_index(site, {dive.fingerprint for dive in read_site(site)})
+    missing = [dive for dive in taking if dive not in index.dives]
+    for dive in missing:
+        try:
+            index.add(dive, taking[dive].places)
+        except InputError as error:
+            left_out[taking.pop(dive).dive.name] = str(error)
+    _require(site, taking, left_out)
+    if missing:
+        index.write(site)
+    return index
+
+
+def _links_from(
+    site: Path, dives: Sequence[str], dive: str, links: DiveLinks
+) -> list[tuple[str, DiveLinks]]:
+    """Of those of ``dives`` that ``dive`` was not looked for in, but that were looked for in it:
+    what that found."""
+    found = []
+    for other in dives:
+        theirs = None if other in links.among else read_links(site, other)
+        if theirs is not None and dive in theirs.among:
+            rows = theirs.rows[theirs.rows["dive"] == theirs.among.index(dive)]
+            found.append((other, DiveLinks(theirs.among, rows)))
     return found
 
 
-def _merge(
-    taking: Sequence[Taking],
-    left_out: dict[str, str],
-    found: dict[tuple[int, int], list[CrossLink]],
-) -> MergedSite:
-    files = [each.places for each in taking]
-    sub_maps = [
-        sub_map
-        for index, each in enumerate(taking)
-        for sub_map in sub_maps_of(index, each.places, each.frames)
-    ]
-    joint = JointGraph(sorted(sub_maps, key=by_knowledge), files)
-    judged = join(joint, found)
-    return place(joint, [each.dive for each in taking], left_out, judged)
+def _look_up(
+    site: Path,
+    taking: Mapping[str, Taking],
+    index: PlaceIndex,
+    dive: str,
+    among: Sequence[str],
+    progress: Progress,
+) -> DiveLinks:
+    name = taking[dive].dive.name
 
+    def advance(done: int, total: int) -> None:
+        progress(name, done, total)
 
-# --------------------------------------------------------------------------------------------------
-# Links of two dives on disk, so that a merge which was cut off, or gets one dive more, goes on.
-
-FOLDER = "links"
-"""In a site."""
-METHOD = 2
-"""Raised whenever the same dives would give other links."""
-
-
-def link_file(site: Path, a: SiteDive, b: SiteDive) -> Path:
-    """The file of the links between two dives."""
-    return site / FOLDER / f"{a.fingerprint[:16]}_{b.fingerprint[:16]}.json"
-
-
-def write_links(path: Path, a: SiteDive, b: SiteDive, links: list[CrossLink]) -> None:
-    """Write the links between two dives, whole or not at all.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    try:
-        make_subfolder(path.parent)
-    except OSError as error:
-        raise InputError(f"cannot make {path.parent}: {error.strerror}; make room") from error
-    write_json(path, {"of": _of(a, b), "links": [_to_json(link) for link in links]})
-
-
-def read_links(path: Path, a: SiteDive, b: SiteDive) -> list[CrossLink] | None:
-    """The links between two dives as they are now; None where they are to be looked for."""
-    try:
-        data = read_regular_json(path, folders=1)
-        if data["of"] != _of(a, b):
-            return None
-        return [_of_json(stated) for stated in data["links"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _of(a: SiteDive, b: SiteDive) -> list[Any]:
-    return [METHOD, a.fingerprint, b.fingerprint]
-
-
-def _to_json(link: CrossLink) -> dict[str, Any]:
-    T = link.T_ba
-    return {
-        "a": link.a, "b": link.b, "R": T.R.tolist(), "t": T.t.tolist(), "scale": float(T.scale),
-        "information": link.information.tolist(), "inliers": link.inliers,
-        "matched": link.matched, "cells": link.cells, "similarity": link.similarity,
-    }  # fmt: skip
-
-
-def _of_json(stated: dict[str, Any]) -> CrossLink:
-    T = Sim3(np.array(stated["R"]), np.array(stated["t"]), float(stated["scale"]))
-    information = np.array(stated["information"], np.float64)
-    if T.R.shape != (3, 3) or T.t.shape != (3,) or information.shape != (7, 7):
-        raise ValueError("it is no link")
-    inliers, matched, cells = (int(stated[name]) for name in ("inliers", "matched", "cells"))
-    return CrossLink(
-        int(stated["a"]), int(stated["b"]), T, information, inliers, matched, cells,
-        float(stated["similarity"]),
-    )  # fmt: skip
+    links = find_links(index, lambda each: taking[each].places, dive, among, advance)
+    say(site, "looked_up", dive=name, among=len(among), links=len(links.rows))
+    return links
 
 
 # --------------------------------------------------------------------------------------------------

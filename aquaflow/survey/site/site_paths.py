@@ -16,14 +16,22 @@ from aquaflow.geometry.similarity import Sim3, Sim3Batch, quaternion_from_rotati
 from aquaflow.survey.site.merged_file import MergedSite
 
 
-def write_paths(site: Path, folders: Mapping[str, Path], merged: MergedSite) -> None:
-    """Write paths/DIVE_COMPONENT.tum for every dive and component; others are removed.
+def write_paths(
+    site: Path, folders: Mapping[str, Path], merged: MergedSite, before: MergedSite | None = None
+) -> None:
+    """Write paths/DIVE_COMPONENT.tum for every dive and component that does not lie there as it did
+    in the merge ``before``; those that nothing lies at any more are removed.
 
     Raises:
         InputError: a trajectory cannot be read, or a file cannot be written.
     """
     written = set()
+    there = {path.name for path in (site / FOLDER).glob("*.tum")}
     for index, name in enumerate(merged.fingerprints):
+        names = {f"{name}_{placed.component}.tum" for placed in merged.of_dive(name)}
+        if before is not None and names <= there and _is_unmoved(merged, before, name):
+            written |= {site / FOLDER / each for each in names}
+            continue
         for component, path in _paths_of(folders[name], index, name, merged).items():
             target = site / FOLDER / f"{name}_{component}.tum"
             _make(target.parent)
@@ -34,6 +42,17 @@ def write_paths(site: Path, folders: Mapping[str, Path], merged: MergedSite) -> 
     for old in (site / FOLDER).glob("*.tum"):
         if old not in written:
             old.unlink(missing_ok=True)
+
+
+def _is_unmoved(merged: MergedSite, before: MergedSite, dive: str) -> bool:
+    """Whether a dive lies where it did, in the same unit."""
+    units = [
+        [each.components[placed.component]["unit"] for placed in each.of_dive(dive)]
+        for each in (merged, before)
+    ]
+    return units[0] == units[1] and all(
+        merged.has_as(before, dive, placed.number) for placed in merged.of_dive(dive)
+    )
 
 
 def _paths_of(folder: Path, index: int, name: str, merged: MergedSite) -> dict[int, Trajectory]:

@@ -109,8 +109,10 @@ class PoseGraph:
         cls,
         tables: Mapping[str, Rows],  # as from tables
         config: GraphConfig,
+        settled: int = 0,
     ) -> PoseGraph:
-        """The graph of ``tables``; every edge counts as new for the next optimisation."""
+        """The graph of ``tables``; every edge from ``settled`` on counts as new for the next
+        optimisation."""
         graph = cls(config)
         for table, rows in (
             (graph._nodes, tables["nodes"].astype(NODE)),
@@ -121,7 +123,7 @@ class PoseGraph:
                 table.replace(rows)
         graph._row = {int(number): row for row, number in enumerate(graph._nodes.rows["number"])}
         graph._members = Counter(graph._nodes.rows["component"].tolist())
-        graph._settled = 0
+        graph._settled = settled
         graph._seen = len(graph._nodes)
         return graph
 
@@ -179,6 +181,16 @@ class PoseGraph:
     def component_of(self, number: int) -> int:
         """The first keyframe of the component that a keyframe belongs to."""
         return int(self._nodes.rows["component"][self._row[number]])
+
+    def move_component(self, number: int, S: Sim3) -> None:
+        """Take the component of keyframe ``number`` by ``S`` to another world, in which that
+        keyframe is the one that stays. Not while a snapshot is being solved."""
+        nodes, before = self._nodes.rows.copy(), self.component_of(number)
+        rows = np.flatnonzero(nodes["component"] == before)
+        write_poses(nodes, rows, (Sim3Batch.of([S]) @ poses_of(nodes[rows])).on_group())
+        nodes["component"][rows] = number
+        self._nodes.replace(nodes)
+        self._members[number] = self._members.pop(before)
 
     def snapshot(self) -> Snapshot:
         """The graph's current state, to be solved in any thread; no copy is made."""

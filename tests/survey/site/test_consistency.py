@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,10 +11,19 @@ from hypothesis import strategies as st
 
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.site.joining import LEAST_AGREEING, Mask, agreement, compatible_links
+from aquaflow.keyframes.place import NAME, PlacesFile
+from aquaflow.survey.site.joining import LEAST_AGREEING, Mask, agreement, compatible_links, join
+from aquaflow.survey.site.joint_graph import (
+    AGAINST_OTHERS,
+    ALONE,
+    JOINT_LINK,
+    USED,
+    JointGraph,
+)
 from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.loop_admission import Chains
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
+from tests.survey.site.site_dives import Scene, stated_dive
 
 SIGMA = 0.01
 
@@ -115,3 +126,47 @@ def test_a_link_that_is_off_in_any_direction_agrees_with_none(direction: int) ->
 
 def test_a_pair_of_keyframes_cannot_confirm_itself() -> None:
     assert not verdict_on(claim(10, 0), claim(10, 0)).any()
+
+
+def seen(joint: JointGraph, b: int, a: int, off: Sim3 | None = None) -> np.ndarray:
+    """[1] JOINT_LINK: keyframe ``b`` of the second dive sees keyframe ``a`` of the first, in truth
+    and ``off``."""
+    row = np.zeros(1, JOINT_LINK)
+    row["node_a"], row["node_b"], row["edge"], row["verdict"] = (
+        joint.node(0, a), joint.node(1, b), -1, ALONE,
+    )  # fmt: skip
+    T_wa, T_wb = (joint.sub_maps[dive].starts.element(number) for dive, number in ((0, a), (1, b)))
+    T_ba = T_wb.inverse() @ T_wa @ (off or Sim3.identity())
+    row["R"], row["t"], row["scale"] = T_ba.R, T_ba.t, T_ba.scale
+    row["a"], row["b"], row["inliers"] = a, b, 50
+    row["information"] = np.eye(7) / SIGMA**2
+    return row
+
+
+@pytest.fixture
+def two_dives(tmp_path: Path) -> JointGraph:
+    joint, scene = JointGraph(), Scene(1)
+    for name, start in (("a", 0.0), ("b", 0.4)):
+        folder = stated_dive(tmp_path / name, scene, start)
+        joint.add(name, PlacesFile(folder / NAME), {})
+        join(joint, np.zeros(0, JOINT_LINK))
+    return joint
+
+
+def test_a_single_link_joins_nothing_until_another_agrees(two_dives: JointGraph) -> None:
+    join(two_dives, seen(two_dives, 1, 3))
+    assert len(two_dives.components()) == 2
+    assert two_dives.links["verdict"].tolist() == [ALONE]
+    join(two_dives, seen(two_dives, 3, 5))
+    assert len(two_dives.components()) == 1
+    assert two_dives.links["verdict"].tolist() == [USED, USED]
+
+
+def test_false_links_never_join_what_they_do_not_agree_on(two_dives: JointGraph) -> None:
+    rng = np.random.default_rng(3)
+    for b, a in ((0, 1), (1, 3), (2, 0), (3, 5), (4, 2)):
+        join(two_dives, seen(two_dives, b, a, Sim3.exp(rng.normal(0.0, 0.6, 7))))
+    assert len(two_dives.components()) == 2
+    join(two_dives, np.concatenate([seen(two_dives, b, b + 1) for b in range(3)]))
+    assert len(two_dives.components()) == 1
+    assert two_dives.links["verdict"].tolist() == [AGAINST_OTHERS] * 5 + [USED] * 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +14,15 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.tum import read_tum
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import NAME as PLACES
-from aquaflow.survey.site import merging
+from aquaflow.survey.site import links, merging
 from aquaflow.survey.site.checking import check_site
-from aquaflow.survey.site.joining import CrossLink
+from aquaflow.survey.site.links import DiveLinks, find_links
 from aquaflow.survey.site.manifest import SiteDive
 from aquaflow.survey.site.merged_file import MergedSite, read_merged
 from aquaflow.survey.site.merging import add_to_site, merge
+from aquaflow.survey.site.place_index import MOST_CANDIDATES
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
+from aquaflow.tracking.loops import Verified, verify_keypoints
 from tests.survey.site.site_dives import SPACING, Scene, stated_dive
 
 WORLD = Sim3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.2, 0.7, np.log(2.5)]))
@@ -102,33 +105,30 @@ def test_merging_again_gives_the_same_bytes(dives: Path, whole: Path, tmp_path: 
     }
 
 
-def test_a_killed_merge_goes_on_with_the_next_pair(
+def test_a_killed_merge_goes_on_with_the_next_dive(
     dives: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site = tmp_path / "site"
     add_to_site(site, [dives / "a", dives / "b", dives / "elsewhere"])
-    compared: list[str] = []
-    whole_search = merging.find_links
+    looked_up: list[str] = []
 
-    def killed_at_the_second(*arguments: object) -> list[CrossLink]:
-        if len(compared) == 1:
+    def killed_at_the_third(*arguments: Any) -> DiveLinks:
+        if len(looked_up) == 2:
             raise KeyboardInterrupt
-        compared.append("first")
-        return whole_search(*arguments)  # type: ignore[arg-type]
+        return counted(*arguments)
 
-    monkeypatch.setattr(merging, "find_links", killed_at_the_second)
+    def counted(*arguments: Any) -> DiveLinks:
+        looked_up.append("once")
+        return find_links(*arguments)
+
+    monkeypatch.setattr(merging, "find_links", killed_at_the_third)
     with pytest.raises(KeyboardInterrupt):
         merge(site)
     assert read_merged(site) is None
-    compared.clear()
-
-    def counted(*arguments: object) -> list[CrossLink]:
-        compared.append("again")
-        return whole_search(*arguments)  # type: ignore[arg-type]
-
+    looked_up.clear()
     monkeypatch.setattr(merging, "find_links", counted)
     merge(site)
-    assert len(compared) == 2
+    assert len(looked_up) == 1
     assert (site / "merged.json").read_bytes() == (whole / "merged.json").read_bytes()
 
 
@@ -251,7 +251,7 @@ def test_a_folder_with_other_files_becomes_no_site(dives: Path, tmp_path: Path) 
 def test_the_log_says_what_was_done(whole: Path) -> None:
     lines = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
     assert [line["event"] for line in lines][:3] == ["added"] * 3
-    assert {"compared", "merged"} <= {line["event"] for line in lines}
+    assert {"looked_up", "merged"} <= {line["event"] for line in lines}
 
 
 def test_a_path_that_is_no_longer_in_a_component_is_removed(whole: Path, tmp_path: Path) -> None:
@@ -266,3 +266,116 @@ def test_a_path_that_is_no_longer_in_a_component_is_removed(whole: Path, tmp_pat
     manifest.write_text(json.dumps(stated))
     merge(tmp_path / "site")
     assert not old.exists()
+
+
+def test_what_is_tried_for_a_new_dive_does_not_grow_with_the_site(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def counted(*arguments: Any) -> Verified | None:
+        tried[-1] += 1
+        return verify_keypoints(*arguments)
+
+    monkeypatch.setattr(links, "verify_keypoints", counted)
+    scene, site = Scene(1), tmp_path / "site"
+    for number in range(8):
+        dive = stated_dive(tmp_path / f"{number}", scene, start=0.1 * number, seed=number, count=4)
+        add_to_site(site, [dive])
+        tried.append(0)
+        merge(site)
+    assert tried[0] == 0
+    assert max(tried) <= 4 * MOST_CANDIDATES
+    assert tried[-1] <= tried[3]
+
+
+def test_dives_added_one_by_one_give_what_all_at_once_give(tmp_path: Path) -> None:
+    scene, sites = Scene(1), [tmp_path / "one_by_one", tmp_path / "at_once"]
+    sure = metric_frame(Sim3(np.eye(3), np.zeros(3), 2.0), 0.01)
+    frames = [None, None, sure, None]
+    dives = [
+        stated_dive(tmp_path / f"{i}", scene, start=0.2 * i, seed=i, count=4, frame=frame)
+        for i, frame in enumerate(frames)
+    ]
+    for dive in dives:
+        add_to_site(sites[0], [dive])
+        merge(sites[0])
+    add_to_site(sites[1], dives)
+    merge(sites[1])
+    one_by_one, at_once = (
+        {name: content for name, content in bytes_of(site).items() if name != "stamps.json"}
+        for site in sites
+    )
+    assert one_by_one == at_once
+
+
+def test_the_order_of_adding_moves_dives_by_little(tmp_path: Path) -> None:
+    scene = Scene(1)
+    dives = [
+        stated_dive(tmp_path / f"{i}", scene, start=0.2 * i, seed=i, count=4) for i in range(4)
+    ]
+    apart = []
+    for name, order in (("forward", dives), ("back", dives[::-1])):
+        add_to_site(tmp_path / name, order)
+        found = merge(tmp_path / name)
+        first, last = (found.of_dive(each)[0].T_sm for each in ("0", "3"))
+        apart.append(first.inverse() @ last)
+    assert np.abs((apart[0].inverse() @ apart[1]).log()).max() < 0.005
+
+
+def test_a_dive_that_was_away_is_looked_up_in_those_added_meanwhile(tmp_path: Path) -> None:
+    scene, site = Scene(1), tmp_path / "site"
+    dives = [
+        stated_dive(tmp_path / f"{i}", scene, start=0.2 * i, seed=i, count=4) for i in range(3)
+    ]
+    add_to_site(site, dives[:2])
+    merge(site)
+    dives[0].rename(tmp_path / "away")
+    add_to_site(site, [dives[2]])
+    assert list(merge(site).left_out) == ["0"]
+    (tmp_path / "away").rename(dives[0])
+    found = merge(site)
+    pairs = [{link["a"]["dive"], link["b"]["dive"]} for link in found.links]
+    assert all(pair in pairs for pair in ({"0", "1"}, {"0", "2"}, {"1", "2"}))
+    keyframes = {
+        tuple(sorted((link[end]["dive"], link[end]["keyframe"]) for end in "ab"))
+        for link in found.links
+    }
+    assert len(keyframes) == len(found.links), "a pair of keyframes is proved twice"
+
+
+def test_a_dive_mapped_anew_takes_its_place(dives: Path, tmp_path: Path) -> None:
+    shutil.copytree(dives, tmp_path / "dives")
+    site = tmp_path / "site"
+    add_to_site(site, [tmp_path / "dives" / "a", tmp_path / "dives" / "b"])
+    merge(site)
+    shutil.rmtree(tmp_path / "dives" / "a")
+    stated_dive(tmp_path / "dives" / "a", Scene(1), start=0.2, seed=8)
+    add_to_site(site, [tmp_path / "dives" / "a"])
+    found = merge(site)
+    assert list(found.fingerprints) == ["a", "b"]
+    assert len(found.components) == 1
+    off = found.of_dive("a")[0].T_sm.inverse() @ found.of_dive("b")[0].T_sm @ WORLD
+    assert np.linalg.norm(off.log()) < 0.02
+
+
+def test_a_copy_of_a_dive_is_left_out(dives: Path, tmp_path: Path) -> None:
+    shutil.copytree(dives / "a", tmp_path / "again")
+    add_to_site(tmp_path / "site", [dives / "a", tmp_path / "again"])
+    assert merge(tmp_path / "site").left_out == {"again": "it is a copy of a"}
+
+
+@pytest.mark.parametrize("name", ["index.npz", "joint.npz", "stamps.json"])
+def test_what_a_site_keeps_to_be_quick_is_made_anew_where_it_is_damaged(
+    dives: Path, tmp_path: Path, name: str
+) -> None:
+    site = tmp_path / "site"
+    add_to_site(site, [dives / each for each in ("a", "b", "elsewhere")])
+    merge(site)
+    before = bytes_of(site)
+    (site / name).write_bytes((site / name).read_bytes()[:100])
+    if name == "index.npz":
+        (site / "joint.npz").unlink()
+        shutil.rmtree(site / "links")
+    merge(site)
+    assert bytes_of(site) == before
