@@ -44,7 +44,7 @@ def map_recording(
         calibration: a ``camera.yaml`` or the camera itself; else the one that comes with the
             recording, else a guess that is refined.
         config: a YAML file of settings, see ``aquaflow config``.
-        preset: ``fast``, ``balanced`` or ``accurate``, on top of ``config``.
+        preset: ``fast``, ``balanced``, ``accurate`` or ``small``, on top of ``config``.
         settings: single settings on top of both, nested as in the YAML file, such as
             ``{"source": {"every": 2}}``.
         overwrite: replace a dive that ``out`` holds already.

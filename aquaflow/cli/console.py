@@ -55,7 +55,7 @@ WhiteBalanceOption = Annotated[
 ]
 
 PRESETS = (
-    "fast | balanced | accurate | onboard-gpu | paper | paper-strict; "
+    "fast | balanced | accurate | small | onboard-gpu | paper | paper-strict; "
     "the last three never measured on a GPU"
 )
 """Help of --preset; a test holds it to the presets that there are."""

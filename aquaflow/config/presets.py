@@ -34,6 +34,22 @@ PRESETS: dict[str, dict[str, Any]] = {
             },
         },
     },
+    "small": {
+        "source": {"width": 320},
+        "tracking": {
+            "keyframe_share": 0.6, "mapping_parallax_widths": 0.25, "matches": 1500,
+            "return_candidates": 1, "retrieval": {"candidates": 1},
+            "adjustment": {"window": 3, "reach": 1, "points": 100, "at_loops": 0},
+        },
+        "mapping": {
+            "max_gaussians": 20_000,
+            "insertion": {"density": 1.0},
+            "medium": {"fit_views": 8},
+            "optimiser": {
+                "steps_keyframe": 4, "steps_mapping": 4, "steps_common": 0, "refine_steps": 400,
+            },
+        },
+    },
     "onboard-gpu": {
         "prior": {"kind": "compact"},
         "mapping": {
@@ -85,12 +101,14 @@ PRESETS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 """What each preset changes of the defaults; `aquaflow lab bench` shows what that buys and costs.
 
-The width stays the same in all: errors in pictures of different widths cannot be compared.
+The width stays the same in all but ``small``: errors in pictures of different widths cannot be
+compared. ``small`` keeps up with 5 pictures a second of a reef on two cores at 40 % and 1.5 GB
+(notes/2026-11-speed.md#small-computer).
 """
 BY_EFFORT = ("fast", "balanced", "accurate")
 """Presets that were measured on a CPU, least effort first."""
 FOR_A_GPU = ("onboard-gpu", "paper", "paper-strict")
-"""The others; no figure of theirs was measured on one (docs/tuning.md#presets)."""
+"""No figure of theirs was measured on one (docs/tuning.md#presets)."""
 
 
 def preset(name: str) -> dict[str, Any]:

@@ -9,7 +9,13 @@ import pytest
 from aquaflow.base.errors import ConfigError
 from aquaflow.cli.console import PRESETS as PRESETS_IN_HELP
 from aquaflow.config import Config, parse_config
-from aquaflow.config.presets import BY_EFFORT, PRESETS, load_configured, merge, preset
+from aquaflow.config.presets import (
+    BY_EFFORT,
+    PRESETS,
+    load_configured,
+    merge,
+    preset,
+)
 from aquaflow.config.vehicle import load_vehicle
 
 ON_A_GPU = ("onboard-gpu", "paper", "paper-strict")
@@ -33,7 +39,7 @@ def test_presets_are_ordered_by_effort() -> None:
 
 
 def test_every_preset_is_in_the_help_and_those_never_measured_say_so() -> None:
-    assert set(PRESETS) == {*BY_EFFORT, *ON_A_GPU}
+    assert set(PRESETS) == {*BY_EFFORT, "small", *ON_A_GPU}
     listed, _, said = PRESETS_IN_HELP.partition(";")
     assert listed.split(" | ") == list(PRESETS)
     assert "never measured on a GPU" in said
