@@ -195,7 +195,9 @@ def _partners(views: Sequence[PosedView], cloud: PointCloud) -> list[list[int]]:
     return partners
 
 
-def _keypoints(picture: Picture) -> Keypoints:
+def _keypoints(
+    picture: Picture,  # [H, W, 3] or [H, W, 4]
+) -> Keypoints:
     mask = picture[..., 3] > 0 if picture.shape[2] == 4 else None
     return detect(normalised_grey(np.ascontiguousarray(picture[..., :3]), mask), mask, KEYPOINTS)
 
@@ -238,12 +240,15 @@ class _Observations:
     keypoint: Index
     """[O] number among those of all views."""
 
-    def __getitem__(self, chosen: npt.NDArray[np.bool_]) -> _Observations:
+    def __getitem__(
+        self,
+        chosen: npt.NDArray[np.bool_],  # [O]
+    ) -> _Observations:
         return _Observations(self.track[chosen], self.view[chosen], self.keypoint[chosen])
 
 
 def _join(
-    links: Sequence[tuple[Index, Index]],
+    links: Sequence[tuple[Index, Index]],  # [M] and [M] keypoints of each pair of views
     first: Index,  # [V + 1] number of each view's first keypoint
 ) -> _Observations:
     """Keypoints that matches connect, over any number of pictures, as one track each."""
@@ -277,7 +282,10 @@ class _Rays:
     plane: Array
     """[O, 2] of the ray at z = 1 of the camera."""
 
-    def __getitem__(self, chosen: npt.NDArray[np.bool_]) -> _Rays:
+    def __getitem__(
+        self,
+        chosen: npt.NDArray[np.bool_],  # [O]
+    ) -> _Rays:
         return _Rays(
             self.centres[chosen], self.directions[chosen], self.R_cu[chosen], self.focal[chosen],
             self.plane[chosen],
