@@ -62,6 +62,7 @@ class Lateness:
 
     @property
     def late(self) -> bool:
+        """True while work beside tracking has to give way."""
         return self.times > 1.0
 
     def rest(self, worked_s: float) -> None:

@@ -258,7 +258,11 @@ class _CompiledAnchor:
     """An anchor's matches at some poses and inverse depths [P]."""
 
     def __init__(
-        self, library: Library, matches: AnchorMatches, poses: Sim3Batch, rho: Array
+        self,
+        library: Library,
+        matches: AnchorMatches,
+        poses: Sim3Batch,
+        rho: Array,  # [P]
     ) -> None:
         T_va = _views_from_anchor(matches, poses)
         numbers = (
