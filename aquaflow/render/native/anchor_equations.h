@@ -1,6 +1,6 @@
-// The normal equations of a joint adjustment, one anchor keyframe at a time. What each line does and
-// why is in aquaflow/tracking/adjustment/equations.py (``equations_by_definition``), whose constants
-// come in; the names are theirs.
+// The normal equations of a joint adjustment, one anchor keyframe at a time. What each line does
+// and why is in aquaflow/tracking/adjustment/equations.py (``equations_by_definition``), whose
+// constants come in; the names are theirs.
 #pragma once
 
 #include <algorithm>
@@ -12,10 +12,10 @@
 namespace aq {
 
 struct AnchorProblem {
-  const double *R, *t;           // [V, 3, 3] and [V, 3] from the anchor to each view
-  const double *rays, *rho;      // [P, 3] and [P]
-  const double *at, *sigma;      // [V, P, 2] and [V]
-  const uint8_t* used;           // [V, P]
+  const double *R, *t;             // [V, 3, 3] and [V, 3] from the anchor to each view
+  const double *rays, *rho;        // [P, 3] and [P]
+  const double *at, *sigma;        // [V, P, 2] and [V]
+  const uint8_t* used;             // [V, P]
   const double *known, *variance;  // [P]
   int32_t views, points;
   double min_z, huber, least_curvature;
@@ -38,8 +38,8 @@ inline SeenPoint see_point(const AnchorProblem& in, int view, int point) {
   const double* at = in.at + 2 * ((size_t)view * in.points + point);
   SeenPoint seen;
   for (int i = 0; i < 3; i++)
-    seen.Y[i] = R[3 * i] * ray[0] + R[3 * i + 1] * ray[1] + R[3 * i + 2] * ray[2] +
-                in.rho[point] * t[i];
+    seen.Y[i] =
+        R[3 * i] * ray[0] + R[3 * i + 1] * ray[1] + R[3 * i + 2] * ray[2] + in.rho[point] * t[i];
   seen.inverse_z = 1.0 / std::max(seen.Y[2], in.min_z);
   for (int i = 0; i < 2; i++) seen.error[i] = seen.Y[i] * seen.inverse_z - at[i];
   return seen;
@@ -58,8 +58,8 @@ inline void anchor_errors(const AnchorProblem& in, double* length) {
   }
 }
 
-// Derivative of one coordinate by a step of a frame: ``J`` is that by the point Y in the frame, over
-// the anchor's depth.
+// Derivative of one coordinate by a step of a frame: ``J`` is that by the point Y in the frame,
+// over the anchor's depth.
 inline void by_similarity(const double* J, const double* Y, double rho, double* out) {
   for (int i = 0; i < 3; i++) out[i] = rho * J[i];
   out[3] = J[2] * Y[1] - J[1] * Y[2];
@@ -82,8 +82,7 @@ struct PointSums {
   double *coupling, *score;  // [n]
 };
 
-inline void add_match(const AnchorProblem& in, int v, int p, size_t n, PointSums& sums,
-                      double* H) {
+inline void add_match(const AnchorProblem& in, int v, int p, size_t n, PointSums& sums, double* H) {
   const SeenPoint seen = see_point(in, v, p);
   const double iz = seen.inverse_z, sigma = in.sigma[v], rho = in.rho[p];
   const double *R = in.R + 9 * v, *t = in.t + 3 * v, *ray = in.rays + 3 * p, *e = seen.error;

@@ -320,10 +320,9 @@ static void adjust(const Scene& s, bool short_of_memory, std::FILE* result) {
     known.push_back(1.1 * rho.back());
     variance.push_back(p % 7 == 0 ? INFINITY : 0.04);
   }
-  const AnchorProblem given{R.data(),  t.data(),    rays.data(),  rho.data(),
-                            at.data(), sigma.data(), used.data(), known.data(),
-                            variance.data(), views,  points,      1e-3,
-                            2.0,       1e-9};
+  const AnchorProblem given{
+      R.data(),     t.data(),        rays.data(), rho.data(), at.data(), sigma.data(), used.data(),
+      known.data(), variance.data(), views,       points,     1e-3,      2.0,          1e-9};
   std::vector<double> lengths(views * points), H(n * n), gradient(n), gain(points * n),
       offset(points), scores(points * n);
   const AnchorSums sums{H.data(), gradient.data(), gain.data(), offset.data(), scores.data()};
