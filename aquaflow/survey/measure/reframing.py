@@ -43,6 +43,11 @@ from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.coverage.coverage_files import write_coverage
 from aquaflow.survey.measure.notes import moved_notes, read_notes, write_notes
 from aquaflow.survey.measure.reef_numbers import CSV, JSON, write_reef_numbers
+from aquaflow.survey.measure.viewpoints import (
+    moved_viewpoints,
+    read_viewpoints,
+    write_viewpoints,
+)
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import (
@@ -150,10 +155,11 @@ def reframe(dive: Dive, sub_map: int, after: WorldFrame) -> None:
     path, places = _moved(dive, sub_map, change)
     table = _rows(dive.poses, sub_map, after, places)
     seen = read_coverage_file(dive.file(COVERAGE)) if dive.has(COVERAGE) else {}
-    texts, notes = {}, []
+    texts, notes, viewpoints = {}, [], []
     if sub_map == main:
         dive.require(METRICS)
         notes = moved_notes(read_notes(folder, before), change)
+        viewpoints = moved_viewpoints(read_viewpoints(folder, before), change)
         texts[METRICS] = dive.metrics | frame_numbers(after) | {"fixes": None}
         if dive.medium_facts:
             texts[MEDIUM] = _medium(deepcopy(dive.medium_facts), after, times)
@@ -172,6 +178,8 @@ def reframe(dive: Dive, sub_map: int, after: WorldFrame) -> None:
             _scale_ranges(folder / HELD_OUT, times)
             if notes:
                 write_notes(folder, notes, after)
+            if viewpoints:
+                write_viewpoints(folder, viewpoints, after)
         if sub_map in seen:
             seen[sub_map] = seen[sub_map].rescale(times, after.unit)
             write_coverage(folder, seen, main)

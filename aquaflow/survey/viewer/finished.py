@@ -26,7 +26,7 @@ from aquaflow.survey.viewer.packing import PackedFile, key_of, read_packed, writ
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.survey.viewer.splats import ViewerSplats
-from aquaflow.survey.viewer.tools import LEVEL, SCALE, PinnedNotes, Tools
+from aquaflow.survey.viewer.tools import LEVEL, SCALE, PinnedNotes, SavedViewpoints, Tools
 from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
@@ -151,16 +151,16 @@ def open_dive(
     white_balance: str | None = None,
     turn: Turn | None = None,
 ) -> ViewerPage:
-    """The page of the finished dive in ``folder``, with its notes, its scale bar (by ``mark``) and,
-    where telemetry has not measured gravity, what turns it level (by ``turn``); in another
-    ``white_balance`` than its own, where one is given.
+    """The page of the finished dive in ``folder``, with its notes and saved views, its scale
+    bar (by ``mark``) and, where telemetry has not measured gravity, what turns it level (by
+    ``turn``); in another ``white_balance`` than its own, where one is given.
 
     Raises:
         InputError: there is no finished dive, the address is taken, or the dive cannot be shown in
             that white balance.
         ConfigError: the token will not do.
     """
-    tools = Tools(others=PinnedNotes(folder).tools())
+    tools = Tools(others=PinnedNotes(folder).tools() | SavedViewpoints(folder).tools())
     page: list[ViewerPage] = []
 
     def read() -> FinishedDive:

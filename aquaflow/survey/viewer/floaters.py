@@ -59,7 +59,10 @@ def find_floaters(gaussians: PlyGaussians, poses: Sequence[Sim3], camera: Camera
     return none
 
 
-def _ranges(means: npt.NDArray[np.floating], poses: Sequence[Sim3]) -> Float:
+def _ranges(
+    means: npt.NDArray[np.floating],  # [N, 3]
+    poses: Sequence[Sim3],
+) -> Float:
     """[N] to the nearest camera."""
     found = cKDTree(np.array([pose.t for pose in poses])).query(means)[0]
     return np.maximum(np.asarray(found, np.float64), 1e-12)

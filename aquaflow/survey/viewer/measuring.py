@@ -105,6 +105,26 @@ def ray_of(given: Asked) -> tuple[Array, Array, float]:
     return vector(given.get("origin"), "the eye"), vector(given.get("direction"), "the ray"), pixel
 
 
+def box_of(given: Any) -> tuple[Array, Array]:
+    """Lowest and highest coordinates [3] of a box; None in place of a coordinate is an open side,
+    in place of the box one that is open all around.
+
+    Raises:
+        InputError: it is no box.
+    """
+    corners = [[None] * 3] * 2 if given is None else given
+    for corner in corners if isinstance(corners, list) and len(corners) == 2 else [None]:
+        if not isinstance(corner, list) or len(corner) != 3:
+            raise InputError("the crop is no box; reload the page")
+        if not all(each is None or is_finite(each) for each in corner):
+            raise InputError("a side of the crop is no number; reload the page")
+    low, high = (
+        np.array([side if each is None else each for each in corner], np.float64)
+        for side, corner in zip((-np.inf, np.inf), corners, strict=True)
+    )
+    return low, high
+
+
 def is_finite(given: Any) -> bool:
     """True of a number of a request that a float holds; of whole numbers there are larger ones."""
     try:

@@ -127,9 +127,9 @@ class Packed:
     def description(self) -> dict[str, Any]:
         """What a browser needs to read the chunks."""
         weight = self._splats.weights().astype(np.float64)
+        weight[: self._splats.floaters] = 0.0
         covered = np.cumsum(weight)[[end - 1 for end in self._ends]] if self._ends else np.zeros(0)
-        surface = len(weight) - self._splats.floaters
-        total = max(float(weight[:surface].sum()), 1e-300)
+        total = max(float(weight.sum()), 1e-300)
         return {
             "version": self.version,
             "count": len(self._splats),

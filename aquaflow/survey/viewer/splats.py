@@ -14,7 +14,7 @@ Levels = npt.NDArray[np.uint8]
 @dataclass(frozen=True)
 class ViewerSplats:
     """N Gaussians in the world; those whose opacity and area are largest come first, and those that
-    float last."""
+    float before them."""
 
     centres: Float
     """[N, 3]"""
@@ -29,7 +29,7 @@ class ViewerSplats:
     levels: dict[str, Levels] = field(default_factory=dict)
     """[N] further values of each, by name: 0 to 255, as a palette has colours for them."""
     floaters: int = 0
-    """How many float, see :mod:`aquaflow.survey.viewer.floaters`: the last ones."""
+    """How many float, see :mod:`aquaflow.survey.viewer.floaters`: the first ones."""
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -68,7 +68,7 @@ def splats(
     sound &= np.isfinite(opacities) & np.isfinite(colours).all(1)
     weight = weights(np.where(sound, opacities, 0.0), np.where(sound[:, None], scales, 0.0))
     floats = np.zeros(len(means), bool) if floaters is None else floaters
-    order = np.lexsort((-weight, floats))
+    order = np.lexsort((-weight, ~floats))
     chosen = order[sound[order]][:budget]
     surface = ~floats[chosen]
     share = float(weight[chosen[surface]].sum() / max(float(weight[~floats].sum()), 1e-12))
@@ -95,7 +95,7 @@ def viewer_splats(
     levels: dict[str, Levels],  # [N] each
     floaters: int = 0,
 ) -> ViewerSplats:
-    """Finite Gaussians in their order, the last of which float."""
+    """Finite Gaussians in their order, the first of which float."""
     return ViewerSplats(
         means.astype(np.float32),
         _unit(quats),

@@ -15,21 +15,30 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.notes import MOST_NOTES, Note, Shape, read_notes, write_notes
 from aquaflow.survey.measure.points import MOST_POINTS
+from aquaflow.survey.measure.viewpoints import LONGEST as LONGEST_NAME
+from aquaflow.survey.measure.viewpoints import (
+    Viewpoint,
+    read_viewpoints,
+    write_viewpoints,
+)
 from aquaflow.survey.viewer.measuring import (
     Asked,
     LengthUnit,
     MeasuringScene,
+    box_of,
     is_finite,
     measure,
     ray_of,
     vector,
 )
 from aquaflow.survey.viewer.picking import pick
+from aquaflow.survey.viewer.section import section
 from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.survey.viewer.viewer_content import ViewerContent
 from aquaflow.telemetry.world_frame import WorldFrame
 
 NOTES, SCALE, LEVEL = ("notes/list", "notes/add", "notes/remove"), "scale", "level"
+VIEWPOINTS = ("viewpoints/list", "viewpoints/add", "viewpoints/remove")
 """Names of the tools that a finished dive has besides."""
 BUSY_S = 20.0
 """A browser waits so long for the one before it; then it is told so."""
@@ -46,7 +55,8 @@ class Tools:
 
     def can(self) -> tuple[str, ...]:
         """Which buttons the page has besides those that measure."""
-        found = {"note": set(NOTES) <= set(self.others)}
+        there = set(self.others)
+        found = {"note": set(NOTES) <= there, "view": set(VIEWPOINTS) <= there}
         found |= {name: name in self.others for name in (SCALE, LEVEL)}
         return tuple(name for name, there in found.items() if there)
 
@@ -82,16 +92,23 @@ class Tools:
         width = 1.0 if camera is None else camera.camera.width / camera.camera.fx
         cameras = exhibit.path[:, :3].astype(np.float64)
         scene = MeasuringScene(shown, cameras, width, np.array(exhibit.up), self.frame)
+        if given.get("what") == "section":
+            return section(asked, given.get("thickness"), scene)
         return measure(str(given.get("what")), asked, scene)
 
     def _shown(self, given: Asked) -> ViewerSplats:
-        """The Gaussians that a browser shows, by what it says of them: with ``all`` those that
-        float too."""
+        """The Gaussians that a browser shows, by what it says of them: with ``all`` what floats
+        too, of those in its ``box``."""
         shown = None if self.exhibit is None else self.exhibit.map
         if shown is None:
             raise InputError("there is no map yet to point at; wait for it")
         splats = shown.splats()
-        return splats if given.get("all") else splats.among(slice(len(splats) - splats.floaters))
+        if not given.get("all"):
+            splats = splats.among(slice(splats.floaters, None))
+        low, high = box_of(given.get("box"))
+        within = (splats.centres >= low) & (splats.centres <= high)
+        inside = np.asarray(within.all(axis=1), bool)
+        return splats if inside.all() else splats.among(inside)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -178,3 +195,59 @@ def _note_in_words(note: Note) -> Asked:
     return {
         "key": note.key, "text": note.text, "shape": note.shape, "places": note.places.tolist(),
     }  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# Views that a browser keeps with a finished dive, in its ``viewpoints.json``.
+
+
+@dataclass(frozen=True)
+class SavedViewpoints:
+    """The saved views of the dive in a folder; one request at a time."""
+
+    dive: Path
+
+    def tools(self) -> dict[str, Callable[[Asked], Asked]]:
+        """What answers, by name."""
+        return dict(zip(VIEWPOINTS, (self.all, self.add, self.remove), strict=True))
+
+    def all(self, _: Asked) -> Asked:
+        """All of them, each with what an address says of it."""
+        found = read_viewpoints(self.dive, self._frame())
+        return {
+            "viewpoints": [{"key": v.key, "name": v.name, "link": v.link} for v in found],
+        }
+
+    def add(self, given: Asked) -> Asked:
+        """One more: its ``name``, and the ``link`` that an address has after its ``#``.
+
+        Raises:
+            InputError: it is no view, or the file cannot be read or written.
+        """
+        name, link = given.get("name"), given.get("link")
+        if not isinstance(name, str) or not name.strip() or len(name) > LONGEST_NAME:
+            raise InputError(f"a view's name has 1 to {LONGEST_NAME} characters; write some")
+        if not isinstance(link, str):
+            raise InputError("the view to keep is none; move it")
+        frame = self._frame()
+        before = read_viewpoints(self.dive, frame)
+        added = Viewpoint.of_link(secrets.token_hex(6), name, link)
+        write_viewpoints(self.dive, [*before, added], frame)
+        return {"key": added.key}
+
+    def remove(self, given: Asked) -> Asked:
+        """The view with ``key``.
+
+        Raises:
+            InputError: there is none, or the file cannot be read or written.
+        """
+        frame = self._frame()
+        before = read_viewpoints(self.dive, frame)
+        left = [each for each in before if each.key != given.get("key")]
+        if len(left) == len(before):
+            raise InputError("there is no such view any more; reload the page")
+        write_viewpoints(self.dive, left, frame)
+        return {}
+
+    def _frame(self) -> WorldFrame:
+        return Dive(self.dive).frame

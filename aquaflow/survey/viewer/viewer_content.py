@@ -109,7 +109,7 @@ class ViewerContent:
     north: str = ""
     """What headings are counted from."""
     can: tuple[str, ...] = ()
-    """Tools that this dive offers beyond measuring: ``notes``, ``scale``."""
+    """Tools that this dive offers beyond measuring: ``note``, ``view``, ``scale``."""
     asked_s: float = -math.inf
     """When a browser last asked for the scene, s of the monotonic clock."""
     _jpeg: tuple[int, bytes] = (-1, b"")

@@ -20,6 +20,7 @@ from aquaflow.survey.measure.levelling import Vertical, make_level, of_pitch, pl
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
 from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.survey.measure.reframing import level, metric, reframe
+from aquaflow.survey.measure.viewpoints import Viewpoint, read_viewpoints, write_viewpoints
 from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, scale_of
 from aquaflow.telemetry.metric_file import read_metric_file, write_metric_file
@@ -68,6 +69,9 @@ def test_the_cameras_pitch_gives_the_vertical_that_telemetry_had(
 def test_every_file_is_turned_alike(dive: Path) -> None:
     place = np.array([[0.5, -0.25, 2.0]])
     write_notes(dive, [Note("a", "crack", "Point", place)], WorldFrame.unknown())
+    box = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+    view = Viewpoint("b", "bow", None, tuple(place[0]), (1.0, 0.0, 0.0), crop=box)
+    write_viewpoints(dive, [view], WorldFrame.unknown())
     before, splats = read_tum(dive / "trajectory.tum"), read_ply(dive / "map.ply")
     make_level(dive, lambda read: of_pitch(read, PITCH_DEG))
     frame = read_metric_file(dive)[0]
@@ -79,6 +83,13 @@ def test_every_file_is_turned_alike(dive: Path) -> None:
     np.testing.assert_allclose(turned.scales, splats.scales, rtol=1e-5)
     [note] = read_notes(dive, frame)
     np.testing.assert_allclose(note.places, place @ R.T, atol=1e-9)
+    [view] = read_viewpoints(dive, frame)
+    assert view.place is not None
+    np.testing.assert_allclose(view.place, (place @ R.T)[0], atol=1e-9)
+    assert view.crop is not None
+    low, high = np.array(view.crop, np.float64).reshape(2, 3)
+    assert (low <= R @ np.ones(3) + 1e-9).all()
+    assert (high >= R @ np.ones(3) - 1e-9).all()
     rows = read_trajectory_csv(dive / "trajectory.csv")
     np.testing.assert_allclose([(r.x, r.y, r.z) for r in rows], after.positions, atol=1e-6)
     pitches = [row.pitch_deg for row in rows]

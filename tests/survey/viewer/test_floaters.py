@@ -15,6 +15,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.finished import finished_dive
 from aquaflow.survey.viewer.floaters import find_floaters
+from aquaflow.survey.viewer.measuring import box_of
 from aquaflow.survey.viewer.packing import Packed
 from aquaflow.survey.viewer.tools import Tools
 from aquaflow.survey.viewer.viewer_content import ShownMap, ViewerContent
@@ -75,24 +76,40 @@ def test_a_map_without_cameras_or_of_nothing_finite_has_none() -> None:
     assert not find_floaters(nothing, POSES, CAMERA).any()
 
 
-def test_a_dives_floaters_come_last_and_the_page_knows_how_many(small_dive: Path) -> None:
+def test_a_dives_floaters_come_first_and_the_page_knows_how_many(small_dive: Path) -> None:
     splats = finished_dive(Dive(small_dive), budget=100_000).splats
     assert 0 < splats.floaters < 0.05 * len(splats)
-    surface = splats.weights()[: -splats.floaters]
+    surface = splats.weights()[splats.floaters :]
     assert (np.diff(surface) <= 0.0).all()
     about = Packed(splats).description()
     assert about["floaters"] == splats.floaters
-    assert about["covered"][-1] > 1.0
+    assert np.isclose(about["covered"][-1], 1.0)
+
+
+def test_who_points_meets_only_what_lies_in_the_crop() -> None:
+    plane = floor(step=0.1)
+    content = ViewerContent("", (0.0, -1.0, 0.0))
+    content.map = ShownMap(lambda: plane, Packed(plane), None, {})
+    ask = Tools(exhibit=content).ask
+    ray = {"origin": [0.0, 0.0, 0.0], "direction": [0.0, 0.0, 1.0], "pixel_rad": 0.001}
+    beside, around = [[1.0, None, None], [None] * 3], [[None] * 3, [None, None, 5.1]]
+    assert ask("pick", ray | {"box": around})["range"] == pytest.approx(DEPTH, rel=0.01)
+    with pytest.raises(InputError, match="nothing there"):
+        ask("pick", ray | {"box": beside})
+
+
+@pytest.mark.parametrize("bad", [5, [], [[0, 0, 0]], [[0, 0], [1, 1]], [["a"] * 3, [None] * 3]])
+def test_a_crop_that_is_no_box_is_refused(bad: object) -> None:
+    with pytest.raises(InputError, match="reload the page"):
+        box_of(bad)
 
 
 def test_who_points_meets_a_floater_only_where_it_is_shown() -> None:
     plane = replace(floor(step=0.1), floaters=1)
-    plane.centres[-1], plane.scales[-1] = (0.0, 0.0, 2.0), 0.2
+    plane.centres[0], plane.scales[0] = (0.0, 0.0, 2.0), 0.2
     content = ViewerContent("", (0.0, -1.0, 0.0))
     content.map = ShownMap(lambda: plane, Packed(plane), None, {})
     tools = Tools(exhibit=content)
     ray = {"origin": [0.0, 0.0, 0.0], "direction": [0.0, 0.0, 1.0], "pixel_rad": 0.001}
     assert tools.ask("pick", ray)["range"] == pytest.approx(DEPTH, rel=0.01)
     assert tools.ask("pick", ray | {"all": True})["range"] == pytest.approx(2.0, rel=0.01)
-    with pytest.raises(InputError, match="no such tool"):
-        tools.ask("floaters", {})

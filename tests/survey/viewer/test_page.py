@@ -22,7 +22,7 @@ from aquaflow.survey.viewer.finished import finished_dive, open_dive
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import water_of
 from aquaflow.survey.viewer.splats import splats
-from aquaflow.survey.viewer.tools import PinnedNotes, Tools
+from aquaflow.survey.viewer.tools import PinnedNotes, SavedViewpoints, Tools
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import metric_frame
@@ -181,6 +181,48 @@ def test_notes_are_kept_in_the_dive_and_removed(dive: Path) -> None:
         again("notes/remove", {"key": kept["key"]})
 
 
+def test_views_are_kept_in_the_dive_and_removed(dive: Path) -> None:
+    ask = Tools(others=SavedViewpoints(dive).tools()).ask
+    assert ask("viewpoints/list", {}) == {"viewpoints": []}
+    link = "at=1,2,-3.5&to=0,0,1&water=40&colours=coverage&all=1&crop=,,-1,,2,"
+    kept = ask("viewpoints/add", {"name": " bow ", "link": link})
+    ask("viewpoints/add", {"name": "start", "link": "pose=0"})
+    found = Tools(others=SavedViewpoints(dive).tools()).ask("viewpoints/list", {})["viewpoints"]
+    assert [(each["name"], each["link"]) for each in found] == [("bow", link), ("start", "pose=0")]
+    assert json.loads((dive / "viewpoints.json").read_text())["viewpoints"][0]["water"] == 40.0
+    ask("viewpoints/remove", {"key": kept["key"]})
+    assert [each["name"] for each in ask("viewpoints/list", {})["viewpoints"]] == ["start"]
+    with pytest.raises(InputError, match="no such view"):
+        ask("viewpoints/remove", {"key": kept["key"]})
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"name": ""}, {"name": 5}, {"name": "x" * 101}, {"link": None}, {"link": ""},
+        {"link": "at=1,2&to=0,0,0"}, {"link": "at=1,2,nan&to=0,0,0"}, {"link": "pose=-1"},
+        {"link": "pose=0&water=900"}, {"link": "pose=0&crop=1,2"}, {"link": "pose=0&colours=<b>"},
+        {"link": "pose=x"}, {"link": "at=1,2,3"},
+    ],
+)  # fmt: skip
+def test_what_is_no_view_is_refused_and_changes_nothing(dive: Path, bad: dict[str, Any]) -> None:
+    tools = Tools(others=SavedViewpoints(dive).tools())
+    with pytest.raises(InputError):
+        tools.ask("viewpoints/add", {"name": "x", "link": "pose=0"} | bad)
+    assert not (dive / "viewpoints.json").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"unit": "furlong", "viewpoints": []}', '{"viewpoints": [5]}']
+)
+def test_a_file_that_holds_no_views_is_refused_and_left(dive: Path, text: str) -> None:
+    (dive / "viewpoints.json").write_text(text)
+    tools = Tools(others=SavedViewpoints(dive).tools())
+    with pytest.raises(InputError, match="correct or remove it"):
+        tools.ask("viewpoints/add", {"name": "x", "link": "pose=0"})
+    assert (dive / "viewpoints.json").read_text() == text
+
+
 @pytest.mark.parametrize(
     "bad",
     [
@@ -217,7 +259,7 @@ def test_a_scale_bar_reaches_the_dive_and_the_page_shows_the_new_unit(dive: Path
         page.close()
     assert asked == [(((0.0, 0.0, 1.0), (1.0, 0.0, 1.0)), 2.0, 0.01)]
     assert said == {"words": "1 map unit is 2 m", "rescaled": True}
-    assert before["can"] == ("note", "scale")
+    assert before["can"] == ("note", "view", "scale")
     assert (before["unit"], after["unit"]) == ("map units", "m")
 
 
@@ -243,7 +285,7 @@ def test_points_on_something_level_reach_the_dive_and_turn_the_page(dive: Path) 
         page.close()
     assert asked == [[(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)]]
     assert said == {"words": "The vertical is known"}
-    assert before["can"] == ("note", "level")
+    assert before["can"] == ("note", "view", "level")
     assert before["up"] != after["up"]
 
 
@@ -251,7 +293,7 @@ def test_a_dive_whose_gravity_was_measured_offers_no_level(dive: Path) -> None:
     write_metric_file(dive, {0: metric_frame()}, main=0)
     page = open_dive(dive, ViewerConfig(port=0, splats=100), None, None, lambda _: "turned")
     try:
-        assert page._exhibit.scene()["can"] == ("note",)
+        assert page._exhibit.scene()["can"] == ("note", "view")
     finally:
         page.close()
 

@@ -200,12 +200,38 @@ def test_what_is_far_from_the_path_is_hidden(shown: Browser, tmp_path: Path) -> 
     until(shown, 0.5, 0.5, tmp_path, "r < 40")
 
 
+def test_a_crop_keeps_what_lies_in_its_box_for_eyes_and_tools(
+    shown: Browser, page: ViewerPage, tmp_path: Path
+) -> None:
+    until(shown, 0.75, 0.5, tmp_path, "r > 90")
+    shown.click("#crop summary")
+    shown.wait("document.querySelector('#crop input')")
+    put(shown, "[data-side='x to']", 100)
+    until(shown, 0.75, 0.5, tmp_path, "r < 40")
+    until(shown, 0.25, 0.5, tmp_path, "r > 90")
+    shown.click("[data-tool=distance]")
+    left, top, width, height = box(shown, "#map")
+    shown.tap(left + 0.75 * width, top + 0.5 * height)
+    shown.wait("document.querySelector('#result').innerText.includes('nothing there')")
+    point(shown, 0.25, 0.5, 1)
+    shown.wait("/crop=,,,-?[\\d.e-]+,,/.test(location.hash)")
+    address = page.address + shown.run("return location.hash")
+    shown.open("about:blank")
+    shown.open(address)
+    shown.wait("window.aquaflowTimes && window.aquaflowTimes.whole")
+    until(shown, 0.75, 0.5, tmp_path, "r < 40")
+    assert shown.text("#crop summary") == "Crop: on"
+    shown.click("#crop summary")
+    shown.click("#crop button")
+    until(shown, 0.75, 0.5, tmp_path, "r > 90")
+
+
 def test_what_floats_is_hidden_until_all_is_asked_for(
     shown: Browser, page: ViewerPage, tmp_path: Path
 ) -> None:
     before = page._exhibit.map
     plane = replace(floor(step=0.1), floaters=1)
-    plane.centres[-1], plane.scales[-1], plane.colours[-1] = (0, 0, 2), 0.3, (0.9, 0.1, 0.1)
+    plane.centres[0], plane.scales[0], plane.colours[0] = (0, 0, 2), 0.3, (0.9, 0.1, 0.1)
     try:
         page.show_splats(plane)
         show(shown, page, SCREEN)
@@ -237,6 +263,29 @@ def test_a_profile_is_drawn_as_a_line(shown: Browser) -> None:
     assert shown.run("return document.querySelectorAll('#chart path').length") == 1
 
 
+def test_a_cross_section_is_drawn_with_its_axes_and_saved(shown: Browser, tmp_path: Path) -> None:
+    shown.click("[data-tool=profile]")
+    point(shown, 0.4, 0.5, 1)
+    point(shown, 0.6, 0.5, 2)
+    shown.click("#section-form button")
+    shown.wait("document.querySelector('#section canvas')?.width > 100")
+    if PICTURES:
+        shown.screenshot(Path(PICTURES) / "viewer_section.png")
+    floor_px, above_px = shown.run(DARK)
+    assert 0.5 < floor_px < 8.0
+    assert above_px == 0
+    x, y, width, height = box(shown, "#section")
+    assert x >= 0 <= y
+    assert x + width <= SCREEN[0]
+    assert y + height <= SCREEN[1]
+    shown.run(SAVED)
+    shown.click("#section button")
+    shown.wait("window.saved")
+    assert shown.run("return window.saved[0]") == "dive_AquaFlow_section.png"
+    shown.click("#section button:last-child")
+    shown.wait("!document.querySelector('#section')")
+
+
 def test_pointing_beside_the_map_says_so_and_the_next_point_is_found(shown: Browser) -> None:
     shown.click("#home")
     shown.click("[data-tool=distance]")
@@ -256,6 +305,24 @@ def test_a_note_is_kept_in_the_dive_shown_and_removed(shown: Browser) -> None:
     shown.wait("document.querySelector('#notes')?.innerText.includes('<b>wreck</b>')")
     shown.click("#notes button")
     shown.wait("!document.querySelector('#notes li')")
+
+
+def test_a_view_is_kept_in_the_dive_led_back_to_and_removed(shown: Browser) -> None:
+    before = eye(shown)[0]
+    put(shown, "#water", 40)
+    shown.wait("location.hash === '#pose=0&water=40'")
+    shown.click("#views summary")
+    shown.wait("document.querySelector('#views input')")
+    shown.type("#views input", "<i>bow</i>\ue007")
+    shown.wait("document.querySelector('#views a')?.innerText === '<i>bow</i>'")
+    put(shown, "#water", 0)
+    shown.click("#home")
+    assert moved(shown, before) > 1.0
+    shown.click("#views a")
+    shown.wait("document.querySelector('#water').value === '40'")
+    assert moved(shown, before) < 1e-3
+    shown.click("#views li button")
+    shown.wait("!document.querySelector('#views a')")
 
 
 def test_three_points_on_something_level_turn_the_map(browser: Browser, page: ViewerPage) -> None:
@@ -416,6 +483,13 @@ def test_the_slider_is_long_and_nothing_is_wider_than_the_window(
     assert shown.text("#where").startswith("0:00 of 1:15")
 
 
+DARK = """
+    const canvas = document.querySelector('#section canvas'), pen = canvas.getContext('2d');
+    const { width, height } = canvas;
+    const dark = (...of) => pen.getImageData(...of).data.filter((v, i) => i % 4 === 0 && v < 200);
+    const wide = width - 92, at = y => dark(70, y, wide, 8).length;
+    return [at((height - 4) / 2 - 4) / wide, at(46)];"""
+"""Pixels of ink at half the height of what is drawn, of its width; and at its top."""
 ARROW_LEFT = "\ue012"
 """A key, as WebDriver names it."""
 SAVED = """

@@ -11,6 +11,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.quantity import Scale
 from aquaflow.survey.viewer.measuring import LengthUnit, MeasuringScene, measure, ray_of
 from aquaflow.survey.viewer.picking import pick, within_reach
+from aquaflow.survey.viewer.section import section
 from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.viewer.planes import DEPTH, floor
 
@@ -122,6 +123,36 @@ def test_a_profile_of_a_plane_is_flat(level: bool) -> None:
     assert np.isclose(line["along"][-1], 4.0, atol=0.05)
     assert np.ptp(line["height"]) < 0.05
     assert (np.array(line["high"]) > np.array(line["low"])).all()
+
+
+@pytest.mark.parametrize("level", [True, False])
+def test_a_cross_section_holds_what_lies_in_its_slice(level: bool) -> None:
+    frame = LengthUnit(Scale("m", 0.0, 0.0), metres=2.0, has_vertical=level)
+    said = section([point(-2.0, 1.0), point(2.0, 1.0)], 0.4, scene(frame))
+    assert said["length"] == pytest.approx(8.0, abs=0.1)
+    along, height, depth = (np.array(said[name]) for name in ("along", "height", "depth"))
+    assert (np.diff(depth) <= 0.0).all()
+    assert np.abs(depth).max() <= 0.2
+    assert 0.0 <= along.min() < 0.1
+    assert along.max() == pytest.approx(8.0, abs=0.1)
+    assert np.abs(height).max() < (0.1 if level else 0.3)  # along the ray the slice is aslant
+    assert len(along) == pytest.approx(81 * 4, rel=0.3)
+    assert np.sqrt(said["xx"]).max() == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("thickness", [0, -1.0, None, "1", 10**400])
+def test_a_cross_section_without_a_thickness_is_refused(thickness: object) -> None:
+    with pytest.raises(InputError, match="positive length"):
+        section([point(0, 0), point(1, 0)], thickness, scene())
+
+
+def test_a_cross_section_of_nothing_or_upright_is_refused() -> None:
+    above = point(0, 0) | {"place": [0.0, 0.0, 2.0]}
+    with pytest.raises(InputError, match="above each other"):
+        section([point(0, 0), above], 0.5, scene())
+    beside = [point(0, 0) | {"place": [x, 90.0, 5.0]} for x in (0.0, 1.0)]
+    with pytest.raises(InputError, match="nothing is mapped"):
+        section(beside, 0.5, scene())
 
 
 @pytest.mark.parametrize(

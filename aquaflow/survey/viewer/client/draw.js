@@ -2,7 +2,6 @@
 // draw in time is left out, the least first.
 
 import { WebGl } from "./webgl.js";
-import { WebGpu } from "./webgpu.js";
 
 const MOVING_MS = 60, STILL_MS = 2500; // of one picture, while the eye moves and when it rests
 const FEWEST = 12000; // that are drawn on however slow a device
@@ -13,17 +12,20 @@ const CLEAR = {
   beta: NONE, B_inf: NONE, b: NONE, B_res: NONE, d: NONE, lamp: [0, 0, 1], gain: ONE, white: ONE, compression: 0, shown_compression: 0,
 };
 
+// Null where the browser has no WebGPU: then its part of the page is not asked for.
+const onGpu = async canvas => navigator.gpu ? (await import("./webgpu.js")).WebGpu.on(canvas) : null;
+
 export class Drawing {
   // `drawn(drawing)` is called after each picture.
   constructor(canvas, drawn) {
     Object.assign(this, { canvas, drawn, about: null, next: null, count: 0, detail: 0, began: null, moving: false });
-    this.look = { water: 0, through: 1, wipe: null, level: -1, rangeLevel: -1, within: 255, all: false };
+    this.look = { water: 0, through: 1, wipe: null, level: -1, rangeLevel: -1, within: 255, all: false, low: [-1e30, -1e30, -1e30], high: [1e30, 1e30, 1e30] };
     this.cost_us = 5; // of a Gaussian; measured from the first picture on
   }
 
   static async on(canvas, drawn) {
     const drawing = new Drawing(canvas, drawn);
-    const webgpu = await WebGpu.on(canvas).catch(error => console.warn(error));
+    const webgpu = await onGpu(canvas).catch(error => console.warn(error));
     drawing.renderer = webgpu ?? new WebGl(drawing);
     webgpu?.device.lost.then(({ message }) => { console.warn(message); drawing.replaceDevice(); })
       .catch(({ message }) => drawing.canvas.replaceWith(message));
@@ -82,15 +84,17 @@ export class Drawing {
 
   // How many are drawn now: as many as the device draws in time; what that is, the first chunk tells.
   get limit() {
-    const { about, look } = this, surface = Math.min(this.count, about.count - (look.all ? 0 : about.floaters));
-    if (this.shownAt === undefined) return Math.min(surface, about.ends[0]);
-    return Math.min(Math.max(surface, this.detail), this.inTime(this.moving ? MOVING_MS : STILL_MS));
+    if (this.shownAt === undefined) return Math.min(this.count, this.about.ends[0]);
+    return Math.min(Math.max(this.count, this.detail), this.inTime(this.moving ? MOVING_MS : STILL_MS));
   }
 
   // How many could be drawn while the eye rests.
   get most() { return this.inTime(STILL_MS); }
 
   inTime(ms) { return Math.max(FEWEST, Math.round(ms * 1000 / this.cost_us / (this.look.wipe === null ? 1 : 2))); }
+
+  // The first ones are those that float, which are hidden until they are asked for.
+  get first() { return this.look.all ? 0 : this.about.floaters; }
 
   // Whether what is on the screen is the last word.
   get still() { return !this.wanted && !this.late && this.began === null && !this.renderer.sorting; }
@@ -136,8 +140,8 @@ export class Drawing {
       background: DARK.map((v, k) => B && look.level < 0 ? v + water * (B[k] - v) : v),
     });
     const sides = look.wipe === null ? [side(0, width, B ? look.water : 0)] : [side(0, at, 1), side(at, width, 0)];
-    const { nearest, limit } = this, water = about.water ?? CLEAR;
-    return { about, look, eye, width, height, fx, fy, cx, cy, sides, water, nearest, count: limit, grown: this.grown() };
+    const { nearest, limit, first } = this, water = about.water ?? CLEAR;
+    return { about, look, eye, width, height, fx, fy, cx, cy, sides, water, nearest, first, count: limit, grown: this.grown() };
   }
 
   // While some are missing, those that are there grow by part of what these would cover.
@@ -146,7 +150,7 @@ export class Drawing {
     const k = ends.findIndex(end => end >= limit), before = k > 0 ? ends[k - 1] : 0;
     const [low, high] = [k > 0 ? covered[k - 1] : 0, covered[k]];
     const share = low + (high - low) * (limit - before) / Math.max(1, ends[k] - before);
-    return Math.min(2.5, Math.max(1e-3, Math.min(share, 1)) ** -0.5);
+    return Math.min(2.5, Math.max(share, 1e-3) ** -0.5);
   }
 
   // Whether the last picture is on the screen; learns what a Gaussian costs.

@@ -8,8 +8,8 @@ const numbers = text => (text ?? "").split(",").map(Number);
 const isPlace = place => place.length === 3 && place.every(Number.isFinite);
 
 export class Link {
-  constructor(eye, line) {
-    Object.assign(this, { eye, line, due: 0 });
+  constructor(eye, line, looks) {
+    Object.assign(this, { eye, line, looks, due: 0 });
     addEventListener("hashchange", () => this.follow());
   }
 
@@ -22,6 +22,7 @@ export class Link {
       said.set("to", place(eye.target));
     }
     for (const [id, usual] of Object.entries(SHOWN)) if (state(find(id)) !== usual) said.set(id, state(find(id)));
+    if (this.looks.cropWords) said.set("crop", this.looks.cropWords);
     return said.toString().replaceAll("%2C", ",");
   }
 
@@ -31,8 +32,15 @@ export class Link {
     this.due = setTimeout(() => history.replaceState(null, "", `#${this.words}`), WAIT_MS);
   }
 
+  // Shows what such words say, also where the address says the same but the eye was moved since.
+  go(words) {
+    history.replaceState(null, "", `#${words}`);
+    this.follow();
+  }
+
   // Shows what the address says; false where it says no view.
   follow() {
+    clearTimeout(this.due); // what is looked at until now is no longer asked for
     const said = new URLSearchParams(location.hash.slice(1)), { eye, line } = this;
     const [at, to, pose] = [numbers(said.get("at")), numbers(said.get("to")), Number(said.get("pose") ?? NaN)];
     if (Number.isInteger(pose) && pose >= 0 && pose < line.count) {
@@ -43,6 +51,7 @@ export class Link {
       line.leave();
       eye.look(at, to);
     } else return false;
+    this.looks.cropWords = said.get("crop") ?? "";
     for (const [id, usual] of Object.entries(SHOWN)) {
       const control = find(id), before = control.value, wanted = said.get(id) ?? usual;
       if (control.type === "checkbox") control.checked = Boolean(wanted);

@@ -1,8 +1,10 @@
 // How the map is coloured and what of it is shown: water, its range, colourings, distance, divider.
 
 const MOST_WATER = 3; // times the range from which most of the map was seen
+const OPEN = [[-Infinity, -Infinity, -Infinity], [Infinity, Infinity, Infinity]]; // the box that keeps all
+const FAR = 1e30; // of an open side, for what draws
 const find = id => document.getElementById(id);
-const rounded = (value, unit) => `${Number(value.toPrecision(2))} ${unit}`;
+export const rounded = (value, unit) => `${Number(value.toPrecision(2))} ${unit}`;
 
 // RGBA of the 256 values of a palette.
 export function colours({ stops, words }) {
@@ -19,7 +21,7 @@ export function colours({ stops, words }) {
 
 export class Looks {
   constructor(changed) {
-    Object.assign(this, { changed, about: null, unit: "", drawing: null, offered: "" });
+    Object.assign(this, { changed, about: null, unit: "", drawing: null, offered: "", box: OPEN, cropped: () => {} });
     find("wipe").addEventListener("change", () => this.wipe());
     for (const id of ["water", "through", "within"]) find(id).addEventListener("input", () => this.apply());
     for (const id of ["colours", "all"]) find(id).addEventListener("change", () => this.apply());
@@ -28,7 +30,25 @@ export class Looks {
   get wiping() { return find("wipe").checked; }
 
   // What of the map is shown, for who points at it.
-  get shown() { return { all: find("all").checked }; }
+  get shown() { return { all: find("all").checked, box: this.box }; }
+
+  // Keeps what lies in a box: its lowest and highest coordinates; all without one.
+  crop(box) {
+    this.box = box ?? OPEN;
+    this.cropped();
+    this.apply();
+  }
+
+  // The box as words of an address, an open side as none; empty where all is kept.
+  get cropWords() {
+    const sides = this.box.flat();
+    return sides.some(Number.isFinite) ? sides.map(v => Number.isFinite(v) ? Number(v.toFixed(4)) : "").join() : "";
+  }
+
+  set cropWords(words) {
+    const sides = words.split(","), box = OPEN.map((open, k) => open.map((v, axis) => Number(sides[3 * k + axis] || v)));
+    this.crop(sides.length === 6 && !box.flat().some(Number.isNaN) ? box : null);
+  }
 
   begin(drawing, placeDivider) { Object.assign(this, { drawing, placeDivider }); }
 
@@ -64,6 +84,8 @@ export class Looks {
   apply() {
     const { about, unit, drawing } = this, look = drawing.look, name = find("colours").value;
     look.all = find("all").checked;
+    find("crop").firstElementChild.textContent = this.cropWords ? "Crop: on" : "Crop";
+    [look.low, look.high] = this.box.map(corner => corner.map(v => Math.max(-FAR, Math.min(FAR, v))));
     look.water = Number(find("water").value) / 100;
     find("water-value").textContent = `${find("water").value} %`;
     if (about.water) {

@@ -27,13 +27,17 @@ const changed = () => {
 const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; }, get tiles() { return detail?.shown; } };
 const drawn = () => {
   marks.camera = line.camera;
+  marks.box = looks.cropWords && looks.box.map((corner, k) => corner.map((v, axis) => {
+    const { middle, half } = drawing.about, end = half[axis] * (k ? 1.25 : -1.25);
+    return Number.isFinite(v) ? v : middle[axis] + end;
+  }));
   marks.draw(eye);
   times.whole = drawing.count === scene.map.count ? times.whole ?? performance.now() : undefined;
 };
 const eye = new Eye([0, -1, 0]), marks = new Marks(find("marks"));
 const looks = new Looks(changed), tools = new ToolBox(marks, looks, changed);
 const line = new TimeLine(eye, changed);
-const link = new Link(eye, line);
+const link = new Link(eye, line, looks);
 window.aquaflowEye = eye; // for who looks at the page from outside, as its tests do
 
 hands(find("marks"), eye, {
@@ -66,6 +70,17 @@ async function rangeAhead() {
     return (await tell("pick", { origin: eye.place, direction: eye.ahead, pixel_rad: 1 / fx, ...looks.shown })).range;
   } catch { return eye.distance; }
 }
+
+find("crop").addEventListener("toggle", async () => {
+  const { Crop } = await import("./crop.js"); // comes when it is wanted
+  new Crop(find("crop").lastElementChild, looks, scene);
+}, { once: true });
+
+find("views").addEventListener("toggle", async () => {
+  const { showViews } = await import("./views.js");
+  const [place, said] = find("views").querySelectorAll("div, p");
+  showViews(place, link, text => { said.textContent = text; });
+}, { once: true });
 
 find("shot").addEventListener("click", async () => {
   const { picture } = await import("./shot.js"); // comes when it is wanted
@@ -132,6 +147,7 @@ async function begin() {
   drawing = await Drawing.on(find("map"), drawn);
   looks.begin(drawing, divider(find("divider"), find("view"), share => { drawing.look.wipe = looks.wiping ? share : null; changed(); }));
   tools.offer(scene.can);
+  find("views").hidden = !scene.can.includes("view");
   const turn = () => { drawing.turn(eye); detail?.look(eye); requestAnimationFrame(turn); };
   requestAnimationFrame(turn);
 }

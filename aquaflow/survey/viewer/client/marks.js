@@ -9,7 +9,7 @@ const PATH = ["#8a3ba8", "#2f9fc0", "#f4e04a"]; // pose hardly known, known, wel
 
 export class Marks {
   constructor(canvas) {
-    Object.assign(this, { canvas, path: [], camera: null, points: [], closed: false, notes: [], picked: null, size: 1 });
+    Object.assign(this, { canvas, path: [], camera: null, points: [], closed: false, box: null, notes: [], picked: null, size: 1 });
   }
 
   // Rows of `ROW` numbers; no line is drawn from one of the `parts` to the next.
@@ -37,6 +37,7 @@ export class Marks {
     if (!eye.lens) this.drawPath();
     if (this.camera && !eye.lens) this.drawCamera();
     if (eye.lens) this.frame(eye.lens, optics);
+    if (this.box) this.drawBox(this.box);
     this.drawPoints();
     this.notes.forEach(note => this.pin(note));
   }
@@ -77,6 +78,12 @@ export class Marks {
       this.line(place, corner, CAMERA);
       this.line(corner, corners[(k + 1) % 4], CAMERA);
     });
+  }
+
+  // Edges between the corners of a box that differ in one axis.
+  drawBox(box) {
+    const corner = k => [0, 1, 2].map(axis => box[k >> axis & 1][axis]);
+    for (let k = 0; k < 8; k++) [1, 2, 4].forEach(bit => k & bit || this.line(corner(k), corner(k | bit), "#ffffff60", 1));
   }
 
   drawPoints() {

@@ -7,7 +7,7 @@ uniform usampler2D data; uniform sampler2D palette;
 uniform mat3 axes; uniform vec3 place; uniform vec2 focal, centre, size;
 uniform vec2 logScales; uniform float brightest, grown, nearest;
 uniform vec3 beta, Binf, b, Bres, d, gain, white, lamp; uniform float water, through, compression, shownCompression;
-uniform int level, rangeLevel; uniform float within;
+uniform int level, rangeLevel; uniform float within; uniform vec3 low, high;
 in vec2 corner; in uint index;
 out vec4 colour; out vec2 at;
 
@@ -44,7 +44,9 @@ void main() {
   uvec4 one = texelFetch(data, texel, 0), two = texelFetch(data, texel + ivec2(1, 0), 0);
   vec4 levels = vec4(bytes(one.w).yzw, 0.0);
   if (rangeLevel >= 0 && levels[rangeLevel] > within) return;
-  vec3 t = transpose(axes) * (uintBitsToFloat(two.yzw) - place);
+  vec3 p = uintBitsToFloat(two.yzw);
+  if (any(lessThan(p, low)) || any(greaterThan(p, high))) return;
+  vec3 t = transpose(axes) * (p - place);
   if (t.z < nearest) return;
   vec2 limit = 1.3 * size / (2.0 * focal);
   vec2 slope = clamp(t.xy / t.z, -limit, limit);

@@ -5,10 +5,10 @@ const BUCKETS = 65536;
 let places = new Float32Array(0); // x, y, z of each
 const counts = new Uint32Array(BUCKETS);
 
-function sorted({ place, ahead, nearest, count }) {
+function sorted({ place, ahead, nearest, first, count }) {
   const depths = new Float32Array(count), among = new Uint32Array(count);
   let shown = 0, low = Infinity, high = -Infinity;
-  for (let i = 0, k = 0; i < count; i++, k += 3) {
+  for (let i = first, k = 3 * first; i < count; i++, k += 3) {
     const depth = (places[k] - place[0]) * ahead[0] + (places[k + 1] - place[1]) * ahead[1] + (places[k + 2] - place[2]) * ahead[2];
     if (!(depth >= nearest)) continue; // nor what has no place
     depths[shown] = depth;

@@ -9,7 +9,9 @@ struct Side {
   B_inf: vec3f, shown_compression: f32,
   b: vec3f, within: f32,  // what exceeds it in `range_level` is hidden; nothing where that is negative
   B_res: vec3f, count: f32,
-  d: vec3f, gain: vec3f, white: vec3f, lamp: vec3f,
+  d: vec3f, first: f32,  // Gaussians that are shown have this number at least
+  gain: vec3f, white: vec3f, lamp: vec3f,
+  low: vec3f, high: vec3f,  // the box that is kept
   background: vec4f,
 }
 
@@ -49,9 +51,11 @@ fn unpack(@builtin(global_invocation_id) id: vec3u) {
   let one = words[2 * i]; let two = words[2 * i + 1];
   let first = bytes(one.y); let second = bytes(one.z); let third = bytes(one.w);
   let levels = array<f32, 3>(third.y, third.z, third.w);
-  let hidden = side.range_level >= 0 && levels[u32(max(side.range_level, 0))] > side.within;
+  let p = bitcast<vec3f>(two.yzw);
+  let far = side.range_level >= 0 && levels[u32(max(side.range_level, 0))] > side.within;
+  let hidden = id.x < u32(side.first) || far || any(p < side.low) || any(p > side.high);
   let unit = NEAR_PLANE_M / side.nearest;
-  let t = bitcast<vec3f>(two.yzw) - side.place;
+  let t = p - side.place;
   let scale = exp(side.log_scales.x + vec3f(first.zw, second.x) / 255.0 * (side.log_scales.y - side.log_scales.x));
   let clear = vec3f(second.zw, third.x) / 255.0 * side.brightest;
   var shown: vec3f;

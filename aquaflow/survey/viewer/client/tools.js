@@ -12,7 +12,9 @@ const HINTS = {
 };
 const MOST = { profile: 2, note: 1, scale: 2 };
 const LEAST = { distance: 2, area: 3, profile: 2 };
+const THICK = 0.05; // of a cross-section at first, of its length
 const find = id => document.getElementById(id);
+const number = id => Number(find(id).value.replace(",", "."));
 
 export class ToolBox {
   constructor(marks, looks, changed) {
@@ -21,9 +23,9 @@ export class ToolBox {
       button.addEventListener("click", () => this.choose(this.tool === button.dataset.tool ? null : button.dataset.tool));
     }
     find("again").addEventListener("click", () => this.choose(this.tool));
-    find("note-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.keepNote()); });
-    find("scale-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.setScale()); });
-    find("level-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.setLevel()); });
+    for (const [form, work] of [["note", "keepNote"], ["scale", "setScale"], ["level", "setLevel"], ["section", "section"]]) {
+      find(`${form}-form`).addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this[work]()); });
+    }
   }
 
   offer(can) {
@@ -40,7 +42,7 @@ export class ToolBox {
     for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
     find("hint").textContent = HINTS[tool] || "";
     this.result("");
-    for (const id of ["note-form", "scale-form", "level-form", "again"]) find(id).hidden = true;
+    for (const id of ["note-form", "scale-form", "level-form", "section-form", "again"]) find(id).hidden = true;
     this.marks.canvas.classList.toggle("pointing", tool !== null);
     this.show();
   }
@@ -77,6 +79,7 @@ export class ToolBox {
     find("again").hidden = false;
     this.result("");
     this.show();
+    find("section-form").hidden = true;
     find("note-form").hidden = !(tool === "note" && this.can.includes("note"));
     find("scale-form").hidden = !(tool === "scale" && this.points.length === 2);
     find("level-form").hidden = !(tool === "level" && this.points.length >= 3);
@@ -84,13 +87,29 @@ export class ToolBox {
     if (this.points.length >= (LEAST[tool] ?? Infinity)) await this.measure(turn);
   }
 
-  async measure(turn) {
+  // What the server says of the points.
+  ask(what, more) {
     const points = this.points.map(({ place, sigma, range, ray }) => ({ place, sigma, range, ...ray }));
-    const said = await tell("measure", { what: this.tool, points, ...this.looks.shown });
-    if (turn !== this.turn || points.length !== this.points.length) return;
+    return tell("measure", { what, points, ...this.looks.shown, ...more });
+  }
+
+  async measure(turn) {
+    const { points } = this, count = points.length;
+    const said = await this.ask(this.tool);
+    if (turn !== this.turn || this.points !== points || points.length !== count) return;
     this.quantities = said.quantities;
     find("note-form").hidden = !this.can.includes("note");
     this.result(said.words, said.profile ?? null);
+    find("section-form").hidden = !said.profile;
+    if (said.profile) {
+      find("section-unit").textContent = said.profile.unit;
+      find("thickness").value = Number((THICK * said.profile.along.at(-1)).toPrecision(1));
+    }
+  }
+
+  async section() {
+    const [said, { showSection }] = await Promise.all([this.ask("section", { thickness: number("thickness") }), import("./section.js")]);
+    showSection(said, document.title.replaceAll(/[^\w.-]+/g, "_"));
   }
 
   async keepNote() {
@@ -102,7 +121,6 @@ export class ToolBox {
   }
 
   async setScale() {
-    const number = id => Number(find(id).value.replace(",", "."));
     const said = await tell("scale", { places: this.points.map(point => point.place), length_m: number("length"), sigma_m: number("sigma") });
     this.result(said.words);
     find("scale-form").hidden = true;

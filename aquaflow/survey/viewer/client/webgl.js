@@ -92,8 +92,8 @@ export class WebGl {
   sort(drawing) {
     if (this.sorting) { drawing.wanted = true; return; }
     this.sorting = true;
-    const { nearest, limit, eye } = drawing;
-    this.shown.worker.postMessage({ place: eye.place, ahead: eye.axes[2], nearest, count: limit });
+    const { nearest, first, limit, eye } = drawing;
+    this.shown.worker.postMessage({ place: eye.place, ahead: eye.axes[2], nearest, first, count: limit });
   }
 
   take(order) {
@@ -116,6 +116,8 @@ export class WebGl {
     gl.uniform2f(this.at("focal"), fx, fy);
     gl.uniform2f(this.at("centre"), cx, cy);
     gl.uniform2f(this.at("size"), width, height);
+    three("low", look.low);
+    three("high", look.high);
     gl.uniform2fv(this.at("logScales"), about.log_scales);
     gl.uniform1f(this.at("brightest"), about.brightest);
     gl.uniform1f(this.at("grown"), grown);

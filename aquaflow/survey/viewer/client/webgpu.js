@@ -124,7 +124,7 @@ export class WebGpu {
   }
 
   // The eye, the look of each side, and how many are sorted.
-  writeUniforms({ about, look, eye, width, height, fx, fy, cx, cy, sides, water, nearest, count, grown }) {
+  writeUniforms({ about, look, eye, width, height, fx, fy, cx, cy, sides, water, nearest, first, count, grown }) {
     const { queue } = this.device, blocks = Math.ceil(count / SORTED);
     const camera = new Float32Array(28), limit = [width, height].map((size, k) => MARGIN * size / (2 * [fx, fy][k]));
     camera.set([...eye.axes.flatMap(axis => [...axis, 0]), fx, fy, cx, cy, -limit[0], limit[0], -limit[1], limit[1]]);
@@ -133,7 +133,7 @@ export class WebGpu {
     sides.forEach((side, k) => queue.writeBuffer(this.sides, SLOT * k, new Float32Array([
       ...eye.place, nearest, ...about.log_scales, side.water, look.through, about.brightest, grown, look.level, look.rangeLevel,
       ...water.beta, water.compression, ...water.B_inf, water.shown_compression, ...water.b, look.within, ...water.B_res, count,
-      ...water.d, 0, ...water.gain, 0, ...water.white, 0, ...water.lamp, 0, ...side.background, 1])));
+      ...water.d, first, ...water.gain, 0, ...water.white, 0, ...water.lamp, 0, ...look.low, 0, ...look.high, 0, ...side.background, 1])));
     queue.writeBuffer(this.total, 0, new Uint32Array([count]));
     const passes = new Uint32Array((PASSES + 1) * SLOT / 4);
     for (let k = 0; k < PASSES; k++) passes.set([DIGIT_BITS * k, blocks, k === 0], k * SLOT / 4);
