@@ -338,39 +338,49 @@ def usable(camera: CameraModel) -> CameraModel | None:
 # The frames of a dive that may end before it has keyframes enough for the calibration check.
 
 
+MOST_FRAMES = 16
+"""Whose pictures are kept until the dive ends: 6 MB of 480 x 270 px."""
+
+
 class EarlyViews:
-    """Views of the lens from the first frames of a dive with a calibration."""
+    """Frames of the beginning of a dive with a calibration, evenly; only at the end, and only if
+    there were too few keyframes, are keypoints looked for in them."""
 
     def __init__(self, slam: Slam) -> None:
         self._slam = slam
-        self._views: LensViews | None = None
+        self._frames: list[Tracked] = []
+        self._seen, self._every = 0, 1
 
     def take(self, decided: Sequence[Tracked]) -> None:
         """Frames that are finished; of a dive with keyframes enough none is kept."""
-        keyframes = self._slam.keyframes
-        if len(keyframes) >= MAX_VIEWS:
-            self._views = None
+        if len(self._slam.keyframes) >= MAX_VIEWS:
+            self._frames = []
             return
         for tracked in decided:
             # What repeats an earlier picture has a pose too, and no picture any more.
             repeated = tracked.frame_class is FrameClass.SKIPPED
             if repeated or tracked.T_wc is None or tracked.keyframe is None:
                 continue
-            frame = tracked.frame
-            self._views = self._views or LensViews(frame.camera)
-            rho = _nearness(keyframes[tracked.keyframe])
-            keypoints = partial(self._keypoints, frame)
-            self._views.offer(frame.index, tracked.T_wc, tracked.sub_map, rho, keypoints)
-            if self._views.full:
-                self._views.thin()
+            if self._seen % self._every == 0:
+                self._frames.append(tracked)
+            self._seen += 1
+            if len(self._frames) == MOST_FRAMES:
+                self._frames, self._every = self._frames[::2], 2 * self._every
 
     def lens_error(self) -> LensError | None:
         """The error of the lens that they show; None if they are too few or show too little."""
-        if self._views is None:
+        if not self._frames:
             return None
         results = self._slam.results()
         poses = {t.frame.index: t.T_wc for t in results if t.T_wc is not None}
-        return lens_error_of_frames(self._views.posed_views(poses))
+        views = LensViews(self._frames[0].frame.camera)
+        for tracked in self._frames:
+            frame, T_wc = tracked.frame, poses.get(tracked.frame.index)
+            if T_wc is None or tracked.keyframe is None:
+                continue
+            rho = _nearness(self._slam.keyframes[tracked.keyframe])
+            views.offer(frame.index, T_wc, tracked.sub_map, rho, partial(self._keypoints, frame))
+        return lens_error_of_frames(views.posed_views(poses))
 
     def _keypoints(self, frame: Frame) -> Keypoints:
         return self._slam.prior.encode(frame.image, frame.camera, frame.mask).keypoints

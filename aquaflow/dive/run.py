@@ -215,8 +215,7 @@ class DiveRun:
         with self.profiler.stage("record"):
             self.folder.record(self._row(tracked) for tracked in decided)
         if self.early_views is not None:
-            with self.slam.stages("calibration check"):
-                self.early_views.take(decided)
+            self.early_views.take(decided)
 
     def _row(self, tracked: Tracked) -> FrameRow:
         posed = tracked.T_wc is not None
@@ -398,9 +397,9 @@ class DiveRun:
             return
         with self.slam.stages("calibration check"):
             self.lens_error = lens_error(self.slam.keyframes.readable)
-            early = None if self.early_views is None else self.early_views.lens_error()
-            if not calibration_pass.can_tell(self.lens_error) and calibration_pass.can_tell(early):
-                self.lens_error = early
+            if self.lens_error is None and self.early_views is not None:
+                early = self.early_views.lens_error()
+                self.lens_error = early if calibration_pass.can_tell(early) else None
 
     def _shortcomings(self) -> list[str]:
         gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
