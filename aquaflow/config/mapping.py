@@ -296,7 +296,7 @@ class MappingConfig(StageConfig):
         150_000,
         ge=1000,
         description="of a sub-map in memory; those of ground that is far from what is seen wait in "
-        "files meanwhile, and where all is near, those of least weight make room",
+        "files meanwhile (on a CPU, without a decoder), else those of least weight make room",
     )
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"
