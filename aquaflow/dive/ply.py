@@ -79,7 +79,7 @@ class PlyGaussians:
 
     def rows(
         self,
-        which: Which,
+        which: Which,  # [M] numbers, or [N] bool
     ) -> PlyGaussians:
         """Some of the Gaussians."""
         return PlyGaussians(
@@ -179,7 +179,10 @@ class PlyFile:
         moved._T = T if self._T is None else T @ self._T
         return moved
 
-    def rows(self, which: Which) -> PlyGaussians:
+    def rows(
+        self,
+        which: Which,  # [M] numbers, or [N] bool
+    ) -> PlyGaussians:
         """Some of the Gaussians."""
         table = self._table[which]
 

@@ -72,7 +72,10 @@ class SpatialIndex:
             seen &= (last + reach >= 0.0) & (first - reach <= side)
         return self._whole_chunks(self._rows(seen))
 
-    def _whole_chunks(self, rows: Rows) -> Rows:
+    def _whole_chunks(
+        self,
+        rows: Rows,  # [M]
+    ) -> Rows:
         """``rows`` [M] with some others, so that each is in a whole chunk where it is in one among
         all N, and in the rest where it is in that."""
         count = len(self._order)
@@ -96,7 +99,7 @@ class SpatialIndex:
 
     def _rows(
         self,
-        chosen: npt.NDArray[np.bool_],  # of the blocks
+        chosen: npt.NDArray[np.bool_],  # [B] of the blocks
     ) -> Rows:
         places = (np.flatnonzero(chosen)[:, None] * BLOCK + np.arange(BLOCK)).ravel()
         return np.sort(self._order[places[places < len(self._order)]]).astype(np.intp)

@@ -89,8 +89,9 @@ class CurrentKeyframe:
         if measured is not None:
             self.motion = measured
         elif interval_ns > 0 and self.interval_ns > 0:
-            stretch = min(interval_ns / self.interval_ns, MOST_STRETCH)
-            self.motion = Sim3.exp(stretch * self.motion.log())
+            stretch = interval_ns / self.interval_ns
+            if 1.0 / MOST_STRETCH <= stretch <= MOST_STRETCH:
+                self.motion = Sim3.exp(stretch * self.motion.log())
         self.interval_ns = interval_ns
 
     def moved_to(
@@ -123,7 +124,8 @@ def only_where(
 
 
 MOST_STRETCH = 4.0
-"""Times as long as the last motion's interval: a vehicle may have turned since then."""
+"""Times as long or short as the last motion's interval; beyond, a vehicle has turned since then, or
+a clock was set."""
 SCARCE = 3.0
 """Times ``min_support``: a keyframe that shows less of a frame is left, whatever hides it; another
 such step, and the camera is lost."""

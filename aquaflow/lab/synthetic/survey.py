@@ -183,7 +183,12 @@ class SurveyPictures:
         depth = np.float32(ALTITUDE_M) + _sum(self._relief, x, y, box)
         return depth, self._radiance(x, y, box)
 
-    def _radiance(self, x: Map, y: Map, box: Box) -> Map:
+    def _radiance(
+        self,
+        x: Map,  # [H, W] m
+        y: Map,  # [H, W] m
+        box: Box,
+    ) -> Map:
         """[H, W, 3] of the seabed at ``x`` and ``y`` [H, W], m."""
         brightness = _sum(self._texture, x, y, box)
         tint = _sum(self._tint, x, y, box)

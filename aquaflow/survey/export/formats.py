@@ -397,7 +397,7 @@ def _mesh(job: _Job, together: Mapping[ExportFormat, Path]) -> Made:
             "resolution": mesh.voxel, "sigma": mesh.sigma,
             "texture": None if each is ExportFormat.ply else mesh.texture,
             "unit": unit, "epsg": mesh.where.epsg, "axes": axes,
-            "origin": mesh.origin, "colours": mesh.seen,
+            "origin": list(mesh.origin), "colours": mesh.seen,
         }  # fmt: skip
     return made
 

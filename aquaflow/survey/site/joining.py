@@ -108,14 +108,20 @@ def _between_components(joint: JointGraph) -> list[Index]:
     return [numbers for numbers in groups if len(numbers) >= LEAST_AGREEING]
 
 
-def _add(joint: JointGraph, numbers: Index) -> None:
+def _add(
+    joint: JointGraph,
+    numbers: Index,  # [L] of links
+) -> None:
     """Add links to the graph, those of the most keypoints first."""
     for number in _by_inliers(joint, numbers):
         if joint.graph.add_edge(_edge(joint.links[number])):
             joint.links["edge"][number] = len(joint.graph.tables()["edges"]) - 1
 
 
-def _by_inliers(joint: JointGraph, numbers: Index) -> Index:
+def _by_inliers(
+    joint: JointGraph,
+    numbers: Index,  # [L] of links
+) -> Index:
     return np.asarray(numbers[np.argsort(-joint.links["inliers"][numbers], kind="stable")])
 
 
@@ -138,7 +144,10 @@ class _Comparison:
     against: Index = field(default_factory=lambda: np.zeros(0, np.intp))
 
 
-def _compare(joint: JointGraph, numbers: Index) -> _Comparison:
+def _compare(
+    joint: JointGraph,
+    numbers: Index,  # [L] of links
+) -> _Comparison:
     """Which of the links between two components agree with each other."""
     graph, compared = joint.graph, _by_inliers(joint, numbers)[:MOST_COMPARED]
     tables = graph.tables()

@@ -213,7 +213,11 @@ class JointGraph:
                 nodes[sub_map.nodes] = before[sub_map.nodes]
         self.shown = nodes
 
-    def _append(self, start: Rows, frames: Mapping[int, WorldFrame]) -> list[SubMap]:
+    def _append(
+        self,
+        start: Rows,  # [K]
+        frames: Mapping[int, WorldFrame],
+    ) -> list[SubMap]:
         """Sub-maps of the keyframes ``start`` of one dive, in order."""
         new: list[SubMap] = []
         for number in np.unique(start["sub_map"]).tolist():
@@ -296,7 +300,10 @@ def read_joint(site: Path, frames: Mapping[str, Mapping[int, WorldFrame]]) -> Jo
         return None
 
 
-def _check(arrays: Mapping[str, Rows], dives: int) -> None:
+def _check(
+    arrays: Mapping[str, Rows],  # each [N]
+    dives: int,
+) -> None:
     if any(
         arrays[name].dtype != dtype or arrays[name].ndim != 1 for name, dtype in _DTYPES.items()
     ):

@@ -199,7 +199,11 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every array in a file: the same site gives the same bytes."""
 
 
-def write_arrays(path: Path, about: Any, arrays: dict[str, Array]) -> None:
+def write_arrays(
+    path: Path,
+    about: Any,
+    arrays: dict[str, Array],  # by name, of any shape
+) -> None:
     """Write arrays, and as the array ``about`` what can be stated in JSON, uncompressed.
 
     Raises:

@@ -132,7 +132,7 @@ class MapTiles:
 
 def shown_rows(
     file: PlyFile,
-    rows: Rows,
+    rows: Rows,  # [M]
     grown: float = 1.0,
     levels: Callable[[Float], dict[str, Levels]] = lambda _: {},  # of centres [M, 3]
 ) -> ViewerSplats:
@@ -148,7 +148,7 @@ def shown_rows(
 def _tile(
     means: Float,  # [N, 3]
     weight: Float,  # [N]
-    rows: Rows,
+    rows: Rows,  # [M]
 ) -> MapTile:
     places = means[rows]
     rows = rows[np.argsort(-weight[rows], kind="stable")]
@@ -165,7 +165,7 @@ def _tile(
 
 def _split(
     means: Float,  # [N, 3]
-    rows: Rows,
+    rows: Rows,  # [M]
 ) -> Iterator[Rows]:
     """``rows`` in groups of neighbours, by halves along the axis in which they are spread most."""
     if len(rows) <= MOST_IN_TILE:

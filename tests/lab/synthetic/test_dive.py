@@ -77,7 +77,7 @@ def _seen_from(
 def test_the_same_seed_twice_gives_the_same_bytes(once: Path, tmp_path: Path) -> None:
     write_dive(tmp_path, SHORT, None)
     names = sorted(p.relative_to(once) for p in once.rglob("*") if p.is_file())
-    assert len(names) == 3 * SHORT.frames + 6
+    assert len(names) == 3 * SHORT.frames + 7
     for name in names:
         assert (once / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
