@@ -25,6 +25,8 @@ MOST = 10**6
 def site(small_dive: Path, tmp_path: Path) -> Path:
     """The same dive under two names, merged."""
     dives = [Path(shutil.copytree(small_dive, tmp_path / name)) for name in ("monday", "tuesday")]
+    with (dives[1] / "trajectory.tum").open("a") as path:
+        path.write("# no copy of the first, which a merge would leave out\n")
     add_to_site(tmp_path / "site", dives)
     merge(tmp_path / "site")
     return tmp_path / "site"

@@ -36,6 +36,8 @@ MOVE = Sim3.exp(np.array([0.4, -0.2, 0.1, 0.0, 0.0, 0.5, 0.3]))
 def site(small_dive: Path, tmp_path: Path) -> Path:
     """Two dives of one place, the second of which the merge is made to have put by ``MOVE``."""
     dives = [Path(shutil.copytree(small_dive, tmp_path / name)) for name in ("monday", "tuesday")]
+    with (dives[1] / "trajectory.tum").open("a") as path:
+        path.write("# no copy of the first, which a merge would leave out\n")
     add_to_site(tmp_path / "site", dives)
     merge(tmp_path / "site")
     path = tmp_path / "site" / MERGED
