@@ -64,7 +64,9 @@ def test_the_viewer_shows_it_until_the_dives_lie_elsewhere(command: Cli, site: P
     assert len(found) == sum(counts) < apart
     assert [int((found.levels[DIVE] == k).sum()) for k in (0, 1)] == counts
     path = site / MERGED
-    path.write_text(path.read_text("utf-8").replace('"scale": 1.0', '"scale": 1.5', 1), "utf-8")
+    stated = json.loads(path.read_text("utf-8"))
+    stated["sub_maps"][1]["T_sn"]["scale"] *= 1.5
+    path.write_text(json.dumps(stated), "utf-8")
     moved = read_shown(site, None, MOST)
     assert moved.one_map is None
     assert len(map_of_site(moved, MOST).splats) == apart
