@@ -281,15 +281,17 @@ def write_facts_file(
         np.savez(stream, allow_pickle=False, **{FACTS: np.frombuffer(text, np.uint8)}, **arrays)
 
 
-def read_facts_file(path: Path, folders: int = 0, only: str = "") -> tuple[dict[str, Any], Arrays]:
-    """What was written; ``folders`` as for :func:`aquaflow.base.errors.regular_file.open_regular`;
-    ``only``: what the names of the arrays that are read begin with.
+def read_facts_file(
+    path: Path, folders: int = 0, only: str = "", most_bytes: int | None = None
+) -> tuple[dict[str, Any], Arrays]:
+    """What was written; ``folders`` and ``most_bytes`` as for :func:`open_archive`; ``only``: what
+    the names of the arrays that are read begin with.
 
     Raises:
         UNREADABLE: one of them, of :mod:`aquaflow.base.storage.archive`.
     """
     arrays = read_arrays_of(
-        path, True, folders, wanted=lambda name: name == FACTS or name.startswith(only)
+        path, True, folders, most_bytes, lambda name: name == FACTS or name.startswith(only)
     )
     text = arrays.pop(FACTS).tobytes()
     if len(text) > MOST_FACTS_BYTES:

@@ -9,24 +9,22 @@ The graph grows dive by dive, and is kept on disk as it was after the last.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from aquaflow.base.errors import DamagedError
-from aquaflow.base.storage.archive import UNREADABLE, read_arrays_of
+from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
 from aquaflow.keyframes.place import PlacesFile
 from aquaflow.survey.site.frames import component_of, log_growth
 from aquaflow.survey.site.links import LINK
-from aquaflow.survey.site.place_index import write_arrays
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
@@ -275,15 +273,14 @@ def write_joint(site: Path, joint: JointGraph) -> None:
     tables |= {"shown": joint.shown}
     settled = [joint.settled_nodes, joint.settled_edges]
     about = {"format": FORMAT, "dives": joint.dives, "settled": settled}
-    write_arrays(site / NAME, about, tables)
+    write_facts_file(site / NAME, about, tables)
 
 
 def read_joint(site: Path, frames: Mapping[str, Mapping[int, WorldFrame]]) -> JointGraph | None:
     """The graph in the site's folder; None where there is none of dives that all are among those of
     ``frames``, their frames by fingerprint."""
     try:
-        arrays: dict[str, Any] = read_arrays_of(site / NAME, stored=True, most_bytes=MOST_BYTES)
-        about = json.loads(arrays["about"].tobytes())
+        about, arrays = read_facts_file(site / NAME, most_bytes=MOST_BYTES)
         dives = [str(each) for each in about["dives"]]
         if about["format"] != FORMAT or not set(dives) <= frames.keys():
             return None

@@ -5,7 +5,6 @@ What looking a dive up found is kept on disk: no dive is looked up twice among t
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError
-from aquaflow.base.storage.archive import UNREADABLE, read_arrays_of
+from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.base.storage.atomic import make_subfolder
 from aquaflow.config import VerificationConfig
 from aquaflow.keyframes.place import KeypointDepths, PlacesFile
-from aquaflow.survey.site.place_index import PlaceIndex, SimilarPlace, write_arrays
+from aquaflow.survey.site.place_index import PlaceIndex, SimilarPlace
 from aquaflow.tracking.graph.pose_graph import edge_information
 from aquaflow.tracking.loops import Verified, verify_keypoints
 
@@ -169,15 +168,15 @@ def write_links(site: Path, dive: str, links: DiveLinks) -> None:
     except OSError as error:
         raise InputError(f"cannot make {path.parent}: {error.strerror}; make room") from error
     about = {"of": [METHOD, dive], "among": links.among}
-    write_arrays(path, about, {"links": links.rows})
+    write_facts_file(path, about, {"links": links.rows})
 
 
 def read_links(site: Path, dive: str) -> DiveLinks | None:
     """What looking up the dive with the fingerprint ``dive`` found; None where that is to be
     done."""
     try:
-        arrays = read_arrays_of(_file_of(site, dive), True, folders=1, most_bytes=MOST_BYTES)
-        about, rows = json.loads(arrays["about"].tobytes()), arrays["links"]
+        about, arrays = read_facts_file(_file_of(site, dive), folders=1, most_bytes=MOST_BYTES)
+        rows = arrays["links"]
         among = tuple(str(each) for each in about["among"])
         if about["of"] != [METHOD, dive] or rows.dtype != LINK or rows.ndim != 1:
             return None

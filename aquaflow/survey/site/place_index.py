@@ -6,9 +6,6 @@ proved of a keyframe is bounded, however many dives there are.
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, fields
@@ -19,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError
-from aquaflow.base.storage.archive import UNREADABLE, read_arrays_of
-from aquaflow.base.storage.atomic import atomic_write
+from aquaflow.base.storage.archive import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.config import RetrievalConfig
 from aquaflow.keyframes.place import PlacesFile
 from aquaflow.tracking.loops import InvertedFile, Signature, Vocabulary, take_root
@@ -152,7 +148,7 @@ class PlaceIndex:
             arrays["signs"] = np.concatenate([each.signs for each in self._signatures])
             for name in VOCABULARY:
                 arrays[f"vocabulary_{name}"] = getattr(self._vocabulary, name)
-        write_arrays(site / NAME, {"format": FORMAT, "dives": self.dives}, arrays)
+        write_facts_file(site / NAME, {"format": FORMAT, "dives": self.dives}, arrays)
 
 
 def read_index(site: Path, wanted: Collection[str]) -> PlaceIndex:
@@ -160,8 +156,7 @@ def read_index(site: Path, wanted: Collection[str]) -> PlaceIndex:
     one where there is none that can be used."""
     index = PlaceIndex()
     try:
-        arrays = read_arrays_of(site / NAME, stored=True, most_bytes=MOST_BYTES)
-        about = json.loads(arrays["about"].tobytes())
+        about, arrays = read_facts_file(site / NAME, most_bytes=MOST_BYTES)
         owners = arrays["owners"]
         if about["format"] != FORMAT or owners.dtype != OWNER:
             return index
@@ -169,12 +164,7 @@ def read_index(site: Path, wanted: Collection[str]) -> PlaceIndex:
         if not len(owners):
             index.dives = dives
             return index
-        vocabulary = Vocabulary(
-            *(
-                arrays[f"vocabulary_{name}"]
-                for name in ("mean", "directions", "words", "projection")
-            )
-        )
+        vocabulary = Vocabulary(*(arrays[f"vocabulary_{name}"] for name in VOCABULARY))
         words, signs = arrays["words"].astype(np.int64), arrays["signs"]
         ends = np.cumsum(owners["words"])
         whole = len(words) == len(signs) == ends[-1] and (owners["words"] > 0).all()
@@ -190,28 +180,3 @@ def read_index(site: Path, wanted: Collection[str]) -> PlaceIndex:
     except (*UNREADABLE, IndexError, AttributeError):
         return PlaceIndex()
     return index
-
-
-# --------------------------------------------------------------------------------------------------
-# Files of a site that hold arrays, and are made anew where they are missing or damaged.
-
-EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every array in a file: the same site gives the same bytes."""
-
-
-def write_arrays(
-    path: Path,
-    about: Any,
-    arrays: dict[str, Array],  # by name, of any shape
-) -> None:
-    """Write arrays, and as the array ``about`` what can be stated in JSON, uncompressed.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    stated = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    with atomic_write(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-        for name, array in ({"about": stated} | arrays).items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, array, allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), member.getbuffer())
