@@ -92,8 +92,8 @@ def measure(
     if not point and (shape is not None or note is not None):
         raise ArgumentError("--as and --note need points; give --point for each")
     read = _with_map(dive)
+    from aquaflow.base.storage.table import write_table
     from aquaflow.survey.measure.finished_dive import numbers_of_dive
-    from aquaflow.survey.measure.reef_numbers import write_csv
 
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
         found: PointMeasurements | ReefNumbers
@@ -104,7 +104,7 @@ def measure(
     if note is not None:
         _pin(read, note, found)
     if csv is not None:
-        write_csv(csv, found.rows())
+        write_table(csv, found.rows())
     unit: LengthUnit = "feet" if units is Units.feet else "metres"
     typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found, unit))
 

@@ -6,7 +6,6 @@ that the sub-map's fit has placed. Fixes have no height.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,10 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
-from aquaflow.base.errors.regular_file import open_regular_text
-from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.base.storage.table import csv_text, text_of_cell
+from aquaflow.base.storage.table import read_table, text_of_cell, write_table
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.telemetry.world_frame import FixErrors, Origin, WorldFrame
@@ -148,8 +144,7 @@ def write_fixes_csv(path: Path, rows: Sequence[FixRow]) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    with atomic_write(path) as stream:
-        stream.write(csv_text([COLUMNS, *(row.cells() for row in rows)]).encode("utf-8"))
+    write_table(path, [COLUMNS, *(row.cells() for row in rows)])
 
 
 def read_fixes_csv(path: Path) -> list[FixRow]:
@@ -158,14 +153,7 @@ def read_fixes_csv(path: Path) -> list[FixRow]:
     Raises:
         InputError: it cannot be read, or holds what is no such row.
     """
-    try:
-        with open_regular_text(path) as stream:
-            header, *lines = csv.reader(stream)
-        if tuple(header) != COLUMNS:
-            raise DamagedError("its columns are others")
-        return [_row(dict(zip(COLUMNS, line, strict=True))) for line in lines]
-    except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
+    return read_table(path, COLUMNS, _row)
 
 
 def _row(cells: dict[str, str]) -> FixRow:

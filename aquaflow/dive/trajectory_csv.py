@@ -5,16 +5,12 @@ What is unknown is an empty cell. Positions are those of ``trajectory.tum``.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime, timezone
 from pathlib import Path
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
-from aquaflow.base.errors.regular_file import open_regular_text
-from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.base.storage.table import csv_text
+from aquaflow.base.storage.table import read_table, write_table
 
 NAME = "trajectory.csv"
 DECIMALS = {"t_s": 9, "latitude_deg": 9, "longitude_deg": 9, "x": 6, "y": 6, "z": 6}
@@ -88,8 +84,7 @@ def write_trajectory_csv(path: Path, rows: Sequence[PoseRow]) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    with atomic_write(path) as stream:
-        stream.write(csv_text([COLUMNS, *(row.cells() for row in rows)]).encode("utf-8"))
+    write_table(path, [COLUMNS, *(row.cells() for row in rows)])
 
 
 def read_trajectory_csv(path: Path) -> list[PoseRow]:
@@ -98,14 +93,7 @@ def read_trajectory_csv(path: Path) -> list[PoseRow]:
     Raises:
         InputError: it cannot be read, or holds what is no such row.
     """
-    try:
-        with open_regular_text(path) as stream:
-            header, *lines = csv.reader(stream)
-        if tuple(header) != COLUMNS:
-            raise DamagedError("its columns are others")
-        return [_row(dict(zip(COLUMNS, line, strict=True))) for line in lines]
-    except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
+    return read_table(path, COLUMNS, _row)
 
 
 def _row(cells: dict[str, str]) -> PoseRow:

@@ -11,9 +11,15 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TypeVar
 
-from aquaflow.base.errors import printable_text
+from aquaflow.base.errors import DamagedError, InputError, printable_text, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text
+from aquaflow.base.storage.atomic import atomic_write
+
+Row = TypeVar("Row")
 
 _FORMULA = r"(?='*[=+\-@\t\n＝＋－＠])"
 """What begins a formula, or another cell; a text with apostrophes of its own gets one more."""
@@ -27,6 +33,34 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     lines = ([_harmless(str(cell)) for cell in row] for row in rows)
     csv.writer(text, lineterminator="\n").writerows(lines)
     return text.getvalue()
+
+
+def write_table(path: Path, rows: Iterable[Sequence[object]]) -> None:
+    """Write the rows, the first of which is the header, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_write(path) as stream:
+        stream.write(csv_text(rows).encode("utf-8"))
+
+
+def read_table(
+    path: Path, columns: Sequence[str], row_of: Callable[[dict[str, str]], Row]
+) -> list[Row]:
+    """What ``row_of`` makes of the cells of each row, by column, of a dive's table.
+
+    Raises:
+        InputError: it cannot be read, has other columns, or ``row_of`` raised ValueError.
+    """
+    try:
+        with open_regular_text(path) as stream:
+            header, *lines = csv.reader(stream)
+        if tuple(header) != tuple(columns):
+            raise DamagedError("its columns are others")
+        return [row_of(dict(zip(columns, line, strict=True))) for line in lines]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
 
 
 def text_of_cell(cell: str) -> str:

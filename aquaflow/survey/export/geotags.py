@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.base.storage.table import csv_text
+from aquaflow.base.storage.table import write_table
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import UPRIGHT_FROM_DOWN, UtmGrid, grid_of, to_geodetic
 from aquaflow.dive.restored import picture_name
@@ -149,8 +149,7 @@ def write_geotags(path: Path, tags: Geotags) -> None:
         [name, *_texts(numbers, OTHERS), *_texts(place, DEGREES)]
         for name, numbers, place in zip(tags.files, metres, tags.geodetic, strict=True)
     ]
-    with atomic_write(path) as stream:
-        stream.write(csv_text([COLUMNS, *rows]).encode("utf-8"))
+    write_table(path, [COLUMNS, *rows])
 
 
 def write_geo_txt(path: Path, tags: Geotags) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.base.storage.table import csv_text
+from aquaflow.base.storage.atomic import write_json
+from aquaflow.base.storage.table import write_table
 from aquaflow.survey.coverage.footprint import VISIBLE_CONTRAST
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.survey.measure.areas import WELL_SEEN, areas, way
@@ -242,14 +242,4 @@ def write_reef_numbers(folder: Path, found: ReefNumbers) -> None:
         InputError: a file cannot be written.
     """
     write_json(folder / JSON, found.to_json())
-    write_csv(folder / CSV, found.rows())
-
-
-def write_csv(path: Path, rows: list[list[str]]) -> None:
-    """Write a table with its head.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    with atomic_write(path) as stream:
-        stream.write(csv_text(rows).encode("utf-8"))
+    write_table(folder / CSV, found.rows())
