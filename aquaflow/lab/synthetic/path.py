@@ -6,6 +6,7 @@ For the survey frame and the world see :mod:`aquaflow.lab.synthetic.mounting`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -84,11 +85,22 @@ class Path:
         self,
         t: Array,  # [N] s
     ) -> Array:
-        """Angular rate [N, 3] rad/s in the body frame, by central difference."""
-        half = 1e-4
-        before, after = self.R_wb(t - half), self.R_wb(t + half)
-        turn = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
-        return np.asarray(turn / (2.0 * half))
+        """Angular rate [N, 3] rad/s in the body frame."""
+        return turn_rate(self.R_wb, t)
+
+
+HALF_STEP_S = 1e-4
+"""Of the central difference that gives angular rates."""
+
+
+def turn_rate(
+    R_wb: Callable[[Array], Array],
+    t: Array,  # [N] s
+) -> Array:
+    """[N, 3] rad/s at which a body turns, in its frame; ``R_wb``: [N, 3, 3] where it is then."""
+    before, after = R_wb(t - HALF_STEP_S), R_wb(t + HALF_STEP_S)
+    turn = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
+    return np.asarray(turn / (2.0 * HALF_STEP_S))
 
 
 def plan_path(

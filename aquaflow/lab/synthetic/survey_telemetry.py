@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.mounting import Mountings, mountings_of
+from aquaflow.lab.synthetic.path import turn_rate
 from aquaflow.lab.synthetic.streams import Instrument
 from aquaflow.lab.synthetic.survey import ALTITUDE_M, FPS, SWAY_M, SWAY_RAD, SWAY_S, SurveyPictures
 from aquaflow.lab.synthetic.telemetry import measurement
@@ -79,11 +80,8 @@ class SurveyPath:
         self,
         t: Array,  # [N] s
     ) -> Array:
-        """[N, 3] rad/s in the body frame, by central difference."""
-        half = 1e-4
-        before, after = self.R_wb(t - half), self.R_wb(t + half)
-        turn = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec()
-        return np.asarray(turn / (2.0 * half))
+        """[N, 3] rad/s in the body frame."""
+        return turn_rate(self.R_wb, t)
 
 
 class SurveyTelemetry:
