@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -23,8 +24,8 @@ from aquaflow.tracking.lens_equations import (
     LensView,
     adjust_lens,
     clusters_of,
-    match_pixels,
     model_error,
+    solve_matched,
 )
 from aquaflow.tracking.self_calibration import MIN_VIEWS as MIN_FRAMES
 from aquaflow.tracking.self_calibration import pairs_of as pairs_of_frames
@@ -100,30 +101,16 @@ def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
     chosen = most_turning([each for each in keyframes if each.T_wc.is_finite()])
     if len(chosen) < MIN_VIEWS:
         return None
-    observations = match_pixels([view_of(keyframe) for keyframe in chosen], pairs_of(len(chosen)))
-    if observations is None:
-        return None
-    R_wc = np.stack([keyframe.T_wc.R for keyframe in chosen])
-    centres = np.stack([keyframe.T_wc.t for keyframe in chosen])
-    try:
-        return estimate(observations, R_wc, centres)
-    except np.linalg.LinAlgError:
-        return None
+    views = [view_of(keyframe) for keyframe in chosen]
+    return solve_matched(views, pairs_of(len(views)), estimate)
 
 
 def lens_error_of_frames(views: Sequence[LensView]) -> LensError | None:
     """The same from frames that follow each other closely, which show gross errors alone."""
     if len(views) < MIN_FRAMES:
         return None
-    observations = match_pixels(views, pairs_of_frames(len(views)))
-    if observations is None:
-        return None
-    R_wc = np.stack([view.T_wc.R for view in views])
-    centres = np.stack([view.T_wc.t for view in views])
-    try:
-        return estimate(observations, R_wc, centres, FRAMES_SIGMA)
-    except np.linalg.LinAlgError:
-        return None
+    grossly = partial(estimate, shared_sigma=FRAMES_SIGMA)
+    return solve_matched(views, pairs_of_frames(len(views)), grossly)
 
 
 def view_of(keyframe: Keyframe) -> LensView:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -455,6 +456,27 @@ class _Points:
         if all(view != b[0] for view, _ in self.seen[point]):
             self.seen[point].append(b)
             self._owner[b] = point
+
+
+Found = TypeVar("Found")
+
+
+def solve_matched(
+    views: Sequence[LensView],
+    pairs: Iterable[tuple[int, int]],
+    solve: Callable[[LensObservations, Array, Array], Found],
+) -> Found | None:
+    """What ``solve`` finds from the matches of ``pairs``, and from rotations [V, 3, 3] and centres
+    [V, 3] of ``views`` in the world; None where too little matches, or that determines nothing."""
+    observations = match_pixels(views, pairs)
+    if observations is None:
+        return None
+    R_wc = np.stack([view.T_wc.R for view in views])
+    centres = np.stack([view.T_wc.t for view in views])
+    try:
+        return solve(observations, R_wc, centres)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def match_pixels(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -24,8 +25,8 @@ from aquaflow.tracking.lens_equations import (
     LensObservations,
     LensView,
     adjust_lens,
-    match_pixels,
     model_error,
+    solve_matched,
 )
 
 MIN_VIEWS = 6
@@ -73,15 +74,7 @@ def found_lens(
     """The lens that ``views`` of one guessed camera show; None if they are too few."""
     if len(views) < MIN_VIEWS:
         return None
-    observations = match_pixels(views, pairs_of(len(views)))
-    if observations is None:
-        return None
-    R_wc = np.stack([view.T_wc.R for view in views])
-    centres = np.stack([view.T_wc.t for view in views])
-    try:
-        return estimate(observations, R_wc, centres, start)
-    except np.linalg.LinAlgError:
-        return None
+    return solve_matched(views, pairs_of(len(views)), partial(estimate, start=start))
 
 
 def pairs_of(views: int) -> list[tuple[int, int]]:
