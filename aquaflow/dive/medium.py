@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, reason_or_key
 from aquaflow.water.mounting import Lamp
 
 Rgb: TypeAlias = tuple[float, float, float]
@@ -123,8 +123,8 @@ def medium_of(facts: Mapping[str, Any], file: Path) -> Medium | None:
             lamp=lamp_of(facts),
         )
     except (ValueError, KeyError, TypeError) as error:
-        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
-        raise InputError(f"cannot read the medium {file}: {what}; map the dive again") from error
+        why = f"cannot read the medium {file}: {reason_or_key(error)}; map the dive again"
+        raise InputError(why) from error
 
 
 def lamp_of(facts: Mapping[str, Any]) -> Lamp | None:

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, reason_or_key
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.arrays import sim3_from_json, sim3_to_json
@@ -108,8 +108,8 @@ def _read(folder: Path) -> dict[int, tuple[str, WorldFrame]]:
                 for number, stated in data["sub_maps"].items()
             }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
-        raise InputError(f"cannot read {path}: {what}; map the dive again") from error
+        why = f"cannot read {path}: {reason_or_key(error)}; map the dive again"
+        raise InputError(why) from error
     raise InputError(
         f"{path} has format {data['format']}, this AquaFlow reads format {FORMAT}; update AquaFlow"
     )

@@ -147,6 +147,11 @@ def reason_of(error: BaseException) -> str:
     return f"{_words(type(error).__name__)} in line {found[1]}{column}"
 
 
+def reason_or_key(error: BaseException) -> str:
+    """As :func:`reason_of`, or which key is missing in what AquaFlow reads by name."""
+    return f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
+
+
 def _words(name: str) -> str:
     """``BadZipFile`` as "bad zip file"."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()

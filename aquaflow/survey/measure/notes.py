@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, reason_of, reason_or_key
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.earth import from_geodetic, geodetic
@@ -103,7 +103,7 @@ def read_notes(dive: Path, frame: WorldFrame) -> list[Note]:
     except OSError as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
+        what = reason_or_key(error)
         raise InputError(f"{path} does not hold notes ({what}); correct or remove it") from error
 
 

@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, reason_of, reason_or_key
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.similarity import Sim3
@@ -154,7 +154,7 @@ def read_viewpoints(dive: Path, frame: WorldFrame) -> list[Viewpoint]:
     except OSError as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
+        what = reason_or_key(error)
         raise InputError(f"{path} holds no viewpoints ({what}); correct or remove it") from error
 
 

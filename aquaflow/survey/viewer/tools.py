@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
@@ -167,15 +167,23 @@ class PinnedNotes:
             InputError: there is none, or the file cannot be read or written.
         """
         frame = self._frame()
-        notes = read_notes(self.dive, frame)
-        left = [note for note in notes if note.key != given.get("key")]
-        if len(left) == len(notes):
-            raise InputError("there is no such note any more; reload the page")
+        left = _without(read_notes(self.dive, frame), given.get("key"), "note")
         write_notes(self.dive, left, frame)
         return {}
 
     def _frame(self) -> WorldFrame:
         return Dive(self.dive).frame
+
+
+Kept = TypeVar("Kept", Note, Viewpoint)
+
+
+def _without(kept: Sequence[Kept], key: Any, name: str) -> list[Kept]:
+    """All but the one with ``key``; raises InputError where there is none."""
+    left = [each for each in kept if each.key != key]
+    if len(left) == len(kept):
+        raise InputError(f"there is no such {name} any more; reload the page")
+    return left
 
 
 def _measure(given: Any) -> dict[str, Any]:
@@ -242,10 +250,7 @@ class SavedViewpoints:
             InputError: there is none, or the file cannot be read or written.
         """
         frame = self._frame()
-        before = read_viewpoints(self.dive, frame)
-        left = [each for each in before if each.key != given.get("key")]
-        if len(left) == len(before):
-            raise InputError("there is no such view any more; reload the page")
+        left = _without(read_viewpoints(self.dive, frame), given.get("key"), "view")
         write_viewpoints(self.dive, left, frame)
         return {}
 
