@@ -11,7 +11,7 @@ import pytest
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.checkpoint.resume import resume_folder
 from aquaflow.live.live_dive import LiveDive
-from tests.live.live_scenes import ToldFeed
+from tests.live.live_scenes import ToldFeed, caught_up
 from tests.live.soak import Rounds, Sample, Sampler, descriptors, soak, summary
 
 MOST_VIEWS, MOST_HELD_OUT, ROUNDS = 2, 3, 2
@@ -29,13 +29,6 @@ BOUNDED = VehicleConfig.model_validate(
         "service": SERVICE,
     }
 )
-
-
-def caught_up(dive: LiveDive) -> None:
-    """Wait until mapping has done all that was asked for."""
-    done = threading.Event()
-    dive.parts.maps._post("wait", lambda maps: done.set())
-    assert done.wait(60.0)
 
 
 def test_views_files_threads_and_descriptors_of_a_live_dive_are_bounded(
