@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
@@ -36,7 +36,7 @@ class SiteDive:
 
     def folder(self, site: Path) -> Path:
         """The dive folder."""
-        return Path(os.path.normpath(site / self.path))
+        return Path(os.path.normpath(os.path.join(site, self.path)))
 
 
 def fingerprint(dive: Path) -> str:
@@ -132,7 +132,7 @@ def read_site(site: Path) -> tuple[SiteDive, ...]:
         dives = tuple(SiteDive(**stated) for stated in data["dives"])
         if len({dive.name for dive in dives}) != len(dives):
             raise DamagedError("two dives have one name")
-        if not all(isinstance(part, str) for dive in dives for part in asdict(dive).values()):
+        if not all(isinstance(part, str) for dive in dives for part in vars(dive).values()):
             raise DamagedError("a dive is described by something other than words")
         return dives
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -170,7 +170,7 @@ def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
             there[at] = SiteDive(there[at].name, there[at].path, mark)
             new.append(there[at])
     _make(site)
-    write_json(site / NAME, {"format": FORMAT, "dives": [asdict(dive) for dive in there]})
+    write_json(site / NAME, {"format": FORMAT, "dives": [vars(dive) for dive in there]})
     marks = {dive.fingerprint for dive in there}
     write_stamps(site, {mark: stamp for mark, stamp in stamps.items() if mark in marks})
     return new
@@ -197,7 +197,10 @@ def state_of(site: Path, dive: SiteDive, stamps: dict[str, Stamp] | None = None)
 
 
 def _same(a: Path, b: Path) -> bool:
-    return a.resolve() == b.resolve()
+    try:
+        return a.samefile(b)
+    except OSError:  # one of them is gone
+        return False
 
 
 def _free(name: str, taken: set[str]) -> str:
