@@ -18,7 +18,7 @@ from aquaflow.telemetry.building import problem_of
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.device_clocks import DeviceClocks
 from aquaflow.telemetry.factors import Factor, PositionFactor
-from aquaflow.telemetry.solve import Carried, Solution, TelemetryProblem, solve
+from aquaflow.telemetry.solve import Carried, Solution, TelemetryProblem, dilution, solve
 from aquaflow.telemetry.start import WHITE, Noise, camera_in_body
 from aquaflow.telemetry.state import CLOCK, SCALE, SHIFT, TURN
 from aquaflow.telemetry.telemetry import Telemetry
@@ -244,7 +244,9 @@ def _sigma_alone(problem: TelemetryProblem, solution: Solution, factor: Factor) 
     for other, information in zip(problem.factors, solution.information, strict=True):
         if other is factor or other.kind not in SCALING:
             A = A + information
-    return float(np.sqrt(covariance_of(A)[0, 0]))
+    i = next(i for i, other in enumerate(problem.factors) if other is factor)
+    short = dilution(A, factor, solution.kept[i], solution.information[i])
+    return float(np.hypot(np.sqrt(covariance_of(A)[0, 0]), short))
 
 
 # --------------------------------------------------------------------------------------------------

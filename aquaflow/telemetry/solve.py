@@ -24,7 +24,7 @@ from aquaflow.optimise.least_squares import (
 from aquaflow.optimise.robust import Cauchy, sigma_of
 from aquaflow.telemetry.factors import Factor
 from aquaflow.telemetry.start import Noise, likeliest
-from aquaflow.telemetry.state import MetricState, P
+from aquaflow.telemetry.state import SCALE, MetricState, P
 from aquaflow.telemetry.world_frame import Origin, SourceReport
 
 Array = npt.NDArray[np.float64]
@@ -90,10 +90,37 @@ def solve(
     for derivative, whiten in zip(derivatives.at(found), correlated, strict=True):
         J = whiten(derivative)
         information.append(J.T @ J)
-    covariance = covariance_of(np.diag(prior**-2.0) + np.sum(information, axis=0))
+    total = np.diag(prior**-2.0) + np.sum(information, axis=0)
+    covariance = covariance_of(total)
     if not np.isfinite(covariance).all():
         raise ArithmeticError("the fusion's covariance is not finite")
+    for each in zip(factors, kept, information, strict=True):
+        covariance[SCALE, SCALE] += dilution(total, *each) ** 2
     return Solution(found.state, covariance, kept, noise, tuple(information))
+
+
+def dilution(
+    total: Array,  # [P, P] information of all factors and the prior
+    factor: Factor,
+    kept: Mask,  # [N]
+    information: Array,  # [P, P] of the factor
+) -> float:
+    """Relative 1 sigma by which a pressure depth may make the scale too small, since it is compared
+    with the map's own rise and fall (regression dilution); 0 for other factors.
+
+    Where a map drifts by more than a level vehicle rises, a scale too small fits best: by
+    log(1 + N variance) if all that N residuals hold is the map's, by nothing if it is the sensor's.
+    Nothing tells them apart, so half of it is one sigma. Simulated level dives of ten minutes,
+    whose maps tilt by 0.02 to 0.2 degrees in each root of a second, had scales 1 to 37 % short
+    where 1.8 to 5.2 % were stated, and 55 % where it was 7.9 % (2026-11-28).
+    """
+    if factor.kind != "depth":
+        return 0.0
+    known, without = (1.0 / covariance_of(each)[0, 0] for each in (total, total - information))
+    own = known - without
+    if own <= 0.0:
+        return 0.0
+    return float(0.5 * np.log1p(np.count_nonzero(kept) / own) * own / known)
 
 
 @dataclass(frozen=True)

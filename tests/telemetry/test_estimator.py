@@ -28,6 +28,7 @@ from aquaflow.types import (
     TelemetrySample,
     Velocity,
 )
+from tests.telemetry import simulated_dives
 from tests.telemetry.simulated_dives import (
     NOTHING,
     Swum,
@@ -123,6 +124,33 @@ def test_a_level_survey_has_no_scale_from_depth_and_says_so(dive: Swum) -> None:
     assert "because the camera rose and sank by only 0" in frame.scale_source
     assert frame.T_nm.scale == 1.0
     assert not frame.depth_known
+
+
+@pytest.fixture(scope="module")
+def drifted() -> Swum:
+    """Ten minutes at one height, whose map has bent by more than the vehicle rose."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulated_dives, "TURN_RAD", np.radians(0.2))
+        return swum(
+            config(seed=1, frames=1500, fps=2.5, altitude_swing_m=0.02, scene="flat_sand"),
+            "depth", "attitude", "velocity",
+        )  # fmt: skip
+
+
+def test_a_map_that_drifts_by_more_than_the_vehicle_rises_takes_no_scale_from_depth(
+    drifted: Swum,
+) -> None:
+    frame = estimated(part_of(drifted, "depth", "attitude")).frame
+    assert not frame.metric
+    percent = int(frame.scale_source.split(" to ")[1].split(" %")[0])
+    assert percent > 50
+
+
+def test_a_dvl_is_not_refused_for_the_depth_of_a_map_that_drifted(drifted: Swum) -> None:
+    found = estimated(drifted)
+    assert found.frame.metric
+    assert {each.kind for each in found.frame.sources if each.used == 0} == set()
+    assert abs(scale_error(found, drifted)) < 0.01
 
 
 def test_attitude_alone_is_level_in_the_maps_own_unit(dive: Swum) -> None:
