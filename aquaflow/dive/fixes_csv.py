@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.storage.table import read_table, text_of_cell, write_table
+from aquaflow.base.storage.table import read_table, text_of_cell, text_of_number, write_table
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.telemetry.world_frame import FixErrors, Origin, WorldFrame
@@ -67,7 +67,7 @@ def _text(name: str, value: float | str | bool) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
-        return f"{value:.{DECIMALS.get(name, OTHER_DECIMALS)}f}"
+        return text_of_number(value, DECIMALS.get(name, OTHER_DECIMALS))
     return str(value)
 
 

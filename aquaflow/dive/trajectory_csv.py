@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from datetime import datetime, timezone
 from pathlib import Path
 
-from aquaflow.base.storage.table import read_table, write_table
+from aquaflow.base.storage.table import read_table, text_of_number, write_table
 
 NAME = "trajectory.csv"
 DECIMALS = {"t_s": 9, "latitude_deg": 9, "longitude_deg": 9, "x": 6, "y": 6, "z": 6}
@@ -73,8 +73,7 @@ def _text(name: str, value: int | float | str | datetime | None) -> str:
         utc = value.astimezone(timezone.utc)
         return utc.replace(tzinfo=None).isoformat(timespec="microseconds") + "Z"
     if isinstance(value, float):
-        decimals = DECIMALS.get(name, OTHER_DECIMALS)
-        return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0.000
+        return text_of_number(value, DECIMALS.get(name, OTHER_DECIMALS))
     return str(value)
 
 

@@ -56,6 +56,11 @@ def test_rows_are_read_back_as_they_were(tmp_path: Path) -> None:
         })  # fmt: skip
 
 
+def test_an_error_that_is_rounded_to_zero_has_no_sign() -> None:
+    row = replace(rows()[0], error_east_m=-0.00001)
+    assert dict(zip(COLUMNS, row.cells(), strict=True))["error_east_m"] == "0.0000"
+
+
 def test_numbers_are_of_the_fixes_that_took_part() -> None:
     numbers = fix_numbers({0: FRAME})
     assert numbers is not None

@@ -63,6 +63,11 @@ def read_table(
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
 
 
+def text_of_number(value: float, decimals: int) -> str:
+    """The cell of a number, which has no sign where it is rounded to zero."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+
+
 def text_of_cell(cell: str) -> str:
     """The text that :func:`csv_text` was given for a cell."""
     return _WRITTEN.sub(r"\1", cell)

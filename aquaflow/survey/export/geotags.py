@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.base.storage.table import write_table
+from aquaflow.base.storage.table import text_of_number, write_table
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import UPRIGHT_FROM_DOWN, UtmGrid, grid_of, to_geodetic
 from aquaflow.dive.restored import picture_name
@@ -179,4 +179,4 @@ def _texts(
     numbers: Array,  # [N]
     decimals: int,
 ) -> list[str]:
-    return [f"{number:.{decimals}f}" for number in numbers]
+    return [text_of_number(number, decimals) for number in numbers]
