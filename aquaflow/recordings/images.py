@@ -341,6 +341,9 @@ LISTS = (".csv", ".txt")
 as EuRoC's ``data.csv`` and TUM's ``rgb.txt``."""
 LARGEST_LIST = 64 * 1024 * 1024
 """Bytes: a million pictures and more; a larger file is something else."""
+LONGEST_HEADER = 100
+"""Lines before the first that names a picture; a table without one, such as a log of the vehicle,
+is not read on. EuRoC's and TUM's have one and three."""
 TIME_WORD = re.compile(r"time|stamp", re.IGNORECASE)
 """In the header's name of the times."""
 DECIMAL = re.compile(r"\d{1,19}(\.\d*)?")
@@ -373,18 +376,25 @@ def _may_list(path: Path) -> bool:
 def _times_of_list(path: Path) -> dict[str, int]:
     """Time in ns of each picture that a line of the table names."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        with path.open(encoding="utf-8-sig") as lines:
+            return _times_of_lines(lines)
     except (OSError, UnicodeDecodeError):
         return {}
+
+
+def _times_of_lines(lines: Iterable[str]) -> dict[str, int]:
     times: dict[str, int] = {}
-    column, unit = None, None
-    for line in lines:
+    column, unit, named = None, None, False
+    for number, line in enumerate(lines):
         words = _words_of(line)
         names = [Path(word).name for word in words if Path(word).suffix.lower() in EXTENSIONS]
+        named = named or bool(names)
         if names:
             time_ns = _in_ns(words if column is None else words[column : column + 1], unit)
             if time_ns is not None:
                 times[names[0]] = time_ns
+        elif not named and number >= LONGEST_HEADER:
+            break
         elif column is None and not times:
             column = next((n for n, word in enumerate(words) if TIME_WORD.search(word)), None)
             unit = stated[1] if (stated := UNIT.search(line)) else None
@@ -392,7 +402,7 @@ def _times_of_list(path: Path) -> dict[str, int]:
 
 
 def _words_of(line: str) -> list[str]:
-    line = line.lstrip("# ")
+    line = line.rstrip("\n").lstrip("# ")
     separated = re.split(r"[,;\t]", line) if re.search(r"[,;\t]", line) else line.split()
     return [word.strip("\"' ") for word in separated]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from aquaflow.recordings import images
 from aquaflow.recordings.images import ImageFolder
 from aquaflow.types import Frame
 
@@ -118,6 +120,18 @@ def test_a_table_without_a_time_for_each_picture_is_left_alone(tmp_path: Path, t
     (tmp_path / "list.csv").write_bytes(text.encode("latin-1"))
     camera = folder_of(tmp_path, ["1.png", "2.png"])
     assert "10 a second are assumed" in camera.notes[0]
+
+
+def test_of_a_log_that_names_no_picture_only_the_beginning_is_read() -> None:
+    read = list[int]()
+
+    def log() -> Iterator[str]:
+        for second in range(10_000):
+            read.append(second)
+            yield f"{second},0.1,0.2\n"
+
+    assert images._times_of_lines(log()) == {}
+    assert len(read) == images.LONGEST_HEADER + 1
 
 
 def test_a_camera_of_eurocs_layout_is_read_with_its_calibration(tmp_path: Path) -> None:
