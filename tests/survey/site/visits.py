@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import Config
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.similarity import Sim3, so3_exp
@@ -71,7 +72,7 @@ class VisitRecording:
 
     @classmethod
     def open(cls, path: Path, fps: float | None = None) -> VisitRecording:
-        raise NotImplementedError
+        raise InputError(f"{path} is no visit: one is drawn by its number, not read from files")
 
     def name_of(self, index: int) -> str:
         return self._visit.name_of(index)
