@@ -113,8 +113,9 @@ def note_unfinished(folder: Path) -> str:
 
 def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = None) -> ViewerPage:
     """The viewer's page of ``dive``."""
-    page = ViewerPage(config, f"{dive.folder.resolve().name}: AquaFlow", live=False, tools=tools)
+    page = ViewerPage(config, f"{dive.folder.resolve().name}: AquaFlow", tools=tools)
     fill(page, dive)
+    page.finish()  # who asked in the meantime, as the page of a preview does, asks again
     return page
 
 

@@ -36,12 +36,16 @@ from aquaflow.types import CameraModel
 if TYPE_CHECKING:
     from aquaflow.mapping.state import MapCopy  # it loads torch
 
+COPYING_SHARE = 0.05
+"""Of the process's CPU time, for copies of the map at most: on a busy machine one each
+``refresh_s`` would take much of what mapping gets (notes/2026-11-survey.md#preview)."""
 PICTURE_WIDTH_PX = 240
 """px of the camera's current picture: some kB at each pose."""
 
 
 class LiveViewer(DiveView):
-    """Takes new data from the loop and the maps, and shows them from its own thread."""
+    """Takes new data from the loop and the maps, and shows them from its own thread. The map is
+    copied while a browser looks."""
 
     def __init__(
         self,
@@ -54,8 +58,12 @@ class LiveViewer(DiveView):
         self._page = ViewerPage(config, "AquaFlow")
         self.address = self._page.address
         self._poses: Newest[ViewerPose] = Newest()
-        self._copies: Newest[tuple[int, MapCopy]] = Newest()
-        """With their sub-maps."""
+        self._copies: Newest[tuple[int, MapCopy, float]] = Newest()
+        """With their sub-maps, and s of CPU that they took."""
+        self._copy_at_s = 0.0
+        """The process's CPU time before which no other copy is made."""
+        self._handed = (-1, -1)
+        """Frames of the pose and the picture that were handed over last."""
         self._path = LivePath()
         self._pictures: Mapping[int, Path] = {}
         self._pose_s = self._map_s = 0.0
@@ -69,17 +77,19 @@ class LiveViewer(DiveView):
 
     def show(self, dive: RunningDive) -> None:
         """A dive begins: its path is shown, and no other's."""
-        self._path, self._asked = LivePath(), False
+        self._path, self._asked, self._handed = LivePath(), False, (-1, -1)
 
     def update(self, dive: RunningDive) -> None:
         """Called after every turn of the loop; queues what is new for the browser, never waits."""
         now, latest, frame = time.monotonic(), dive.latest, dive.picture
         if latest is None or frame is None or latest.T_wc is None:
             return
-        if now - self._pose_s >= 1.0 / self._config.pose_hz:
-            self._pose_s = now
+        newest = latest.frame.index, frame.index
+        if now - self._pose_s >= 1.0 / self._config.pose_hz and newest != self._handed:
+            self._pose_s, self._handed = now, newest
             self._hand_over(dive, latest, frame.image)
-        if now - self._map_s >= self._config.refresh_s and not self._asked:
+        due = now - self._map_s >= self._config.refresh_s and not self._asked
+        if due and self._page.watched and time.process_time() >= self._copy_at_s:
             self._map_s, self._asked = now, True
             sub_map = latest.sub_map
             dive.maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
@@ -104,12 +114,13 @@ class LiveViewer(DiveView):
 
     def _copy(self, maps: OwnedMaps, sub_map: int) -> None:
         """In the mapping thread."""
-        self._asked = False
+        self._asked, began_s = False, time.thread_time()
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
             from aquaflow.mapping.state import copy_map  # torch, which has made the map
 
-            self._copies.put((sub_map, copy_map(mapper)))
+            copy = copy_map(mapper)
+            self._copies.put((sub_map, copy, time.thread_time() - began_s))
 
     def _show(self) -> None:
         pose = self._poses.take(LOOK_S)
@@ -125,9 +136,11 @@ class LiveViewer(DiveView):
             self._page.show_path(*path.rows(pictures), path.began)
         taken = self._copies.take(0.0)
         if taken is not None:
-            sub_map, copy = taken
+            (sub_map, copy, took_s), began_s = taken, time.thread_time()
             plan = self._plan(sub_map) if self._plan is not None and self._page.watched else None
             self._page.show_splats(*pack_for_browser(copy, self._config.splats, frame, plan))
+            took_s += time.thread_time() - began_s
+            self._copy_at_s = time.process_time() + took_s / COPYING_SHARE
         self._page.show_health(in_words(report))
 
 
@@ -141,15 +154,21 @@ def frame_of(report: dict[str, Any]) -> LengthUnit:
 
 
 def in_words(report: dict[str, Any]) -> str:
-    """The health panel."""
-    lag = report["lag_ms"]
-    lines = [
-        f"{report['state']}: {report['reason']}",
-        f"{report['fps']:.1f} frames/s, lag {lag['p50'] or 0:.0f} ms (95 %: {lag['p95'] or 0:.0f})",
-        f"slowest stage: {report['slowest_stage'] or '-'}; {report['level']}",
-        f"{report['keyframes']} keyframes, {report['gaussians']} Gaussians",
-        f"{report['overtaken']} frames overtaken, {report['failures']} failed",
-    ]
+    """The health panel: of a service with its pace, which a replay sets itself."""
+    lines = [f"{report['state']}: {report['reason']}"]
+    if "lag_ms" in report:
+        lag = report["lag_ms"]
+        lines += [
+            f"{report['fps']:.1f} frames/s, lag {lag['p50'] or 0:.0f} ms "
+            f"(95 %: {lag['p95'] or 0:.0f})",
+            f"slowest stage: {report['slowest_stage'] or '-'}; {report['level']}",
+        ]
+    if "keyframes" in report:
+        map_of = report["gaussians"]
+        shown = "no map is made" if map_of is None else f"{map_of} Gaussians"
+        lines.append(f"{report['keyframes']} keyframes, {shown}")
+    if "overtaken" in report:
+        lines.append(f"{report['overtaken']} frames overtaken, {report['failures']} failed")
     return "\n\n".join(lines)
 
 
@@ -181,9 +200,12 @@ class LivePath:
         self._depth_m = math.nan
 
     def add(self, tracked: Tracked, frame: WorldFrame) -> None:
-        """A posed frame, in the metric ``frame`` of its sub-map as it is known by now."""
+        """A posed frame, in the metric ``frame`` of its sub-map as it is known by now, once; it may
+        stay the newest for long."""
         T_wc = tracked.T_wc
         assert T_wc is not None
+        if self._rows and self._rows[-1].frame == tracked.frame.index:
+            return
         pose = (*T_wc.t.tolist(), *T_wc.quaternion.tolist(), tracked.quality.inlier_share)
         heading, _, _ = attitude_of(frame, frame.pose(T_wc))
         turned = math.nan if heading is None else heading

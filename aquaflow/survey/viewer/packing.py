@@ -124,18 +124,22 @@ class Packed:
     def _tiles(self) -> dict[str, Any]:
         return {} if self.tiles is None else {"tiles": self.tiles.description()}
 
-    def description(self) -> dict[str, Any]:
-        """What a browser needs to read the chunks."""
+    @cached_property
+    def _covered(self) -> list[float]:
+        """Share of what the Gaussians cover that each chunk ends at."""
         weight = self._splats.weights().astype(np.float64)
         weight[: self._splats.floaters] = 0.0
         covered = np.cumsum(weight)[[end - 1 for end in self._ends]] if self._ends else np.zeros(0)
-        total = max(float(weight.sum()), 1e-300)
+        return (covered / max(float(weight.sum()), 1e-300)).tolist()
+
+    def description(self) -> dict[str, Any]:
+        """What a browser needs to read the chunks."""
         return {
             "version": self.version,
             "count": len(self._splats),
             "floaters": self._splats.floaters,
             "ends": self._ends,
-            "covered": (covered / total).tolist(),
+            "covered": self._covered,
             "middle": self._code.middle.tolist(),
             "half": self._code.half.tolist(),
             "log_scales": self._code.log_scales,

@@ -44,32 +44,35 @@ UP, FIRST_CAMERA_UP = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
 
 class ViewerPage:
-    """A page at ``address``; everything shown replaces what was shown before."""
+    """A page at ``address``, which a browser asks again and again for what is new until it is
+    finished; everything shown replaces what was shown before."""
 
     def __init__(
         self,
         config: ViewerConfig,
         title: str,
-        live: bool = True,
         tools: Tools | None = None,
     ) -> None:
         """Listen at once.
 
         Args:
-            live: the page asks again and again for what is new.
             tools: what else than pointing and measuring this dive offers.
 
         Raises:
             InputError: the address is taken.
             ConfigError: the token will not do.
         """
-        self._exhibit = ViewerContent(title, FIRST_CAMERA_UP, live)
+        self._exhibit = ViewerContent(title, FIRST_CAMERA_UP)
         self._tools = tools or Tools()
         self._tools.exhibit = self._exhibit
         self._exhibit.can = self._tools.can()
         self._server = ViewerServer(config, self._exhibit, self._tools.ask)
         host = f"[{config.host}]" if ":" in config.host else config.host
         self.address = f"http://{host}:{self._server.port}/"
+
+    def finish(self) -> None:
+        """Nothing more will be shown: a browser need not ask again."""
+        self._exhibit.live = False
 
     def close(self) -> None:
         self._server.close()

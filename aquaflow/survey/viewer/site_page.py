@@ -57,7 +57,7 @@ def open_site(site: Path, config: ViewerConfig, component: int | None = None) ->
     key = _key(shown)
     packed = read_packed(site, key)
     whole = cache(partial(map_of_site, shown, config.splats))
-    page = ViewerPage(config, f"{site.resolve().name}: AquaFlow", live=False)
+    page = ViewerPage(config, f"{site.resolve().name}: AquaFlow")
     frame = shown.frame
     page.set_frame(LengthUnit.of(frame), frame.north)
     if packed is not None:
@@ -68,6 +68,7 @@ def open_site(site: Path, config: ViewerConfig, component: int | None = None) ->
         count, total = len(whole().splats), whole().total
     page.show_health(_in_words(shown, count, total))
     _show_paths(page, shown)
+    page.finish()
     prepare(site, key, packed, whole, page)
     return page
 

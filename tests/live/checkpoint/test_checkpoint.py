@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -268,6 +269,7 @@ def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
     config = ViewerConfig(port=0, splats=300)
     window = LiveViewer(config, lambda: report(parts, hang_s=1e6))
     try:
+        urlopen(f"{window.address}scene.json").close()  # a browser looks on
         window.update(parts.loop)
         deadline = time.monotonic() + 60.0
         while window.splats_shown == 0:

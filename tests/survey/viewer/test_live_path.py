@@ -60,6 +60,13 @@ def test_utc_of_the_first_pose_follows_from_what_a_clock_says_now() -> None:
     assert path.began.isoformat() == "2026-11-24T03:00:05.500000+00:00"
 
 
+def test_a_frame_that_stays_the_newest_has_one_pose() -> None:
+    path = LivePath()
+    for index in (3, 3, 4):
+        path.add(tracked(index), WorldFrame.unknown())
+    assert len(path.rows([])[0]) == 2
+
+
 def test_a_long_path_is_thinned() -> None:
     path = LivePath()
     for index in range(LONGEST_PATH + 3):

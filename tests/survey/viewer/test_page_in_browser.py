@@ -36,6 +36,10 @@ PICTURES = os.environ.get("AQUAFLOW_PAGE_PICTURES")
 CAMERA_ABOVE = """
     document.querySelector('#pose').value = 0;
     document.querySelector('#pose').dispatchEvent(new Event('input'));"""
+INK = """
+    (canvas => canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data
+      .filter((value, k) => k % 4 === 3 && value).length)(document.querySelector('#marks'))"""
+"""Pixels that something is drawn on over the map."""
 MOMENTS = np.array([[0.0, 4.2, 271.6, 0, 0.0], [75.0, np.nan, 90.0, 0, 0.0]], np.float32)
 """Of the two poses: seconds, depth, heading, and the picture of the first, which is kept."""
 Box = tuple[float, float, float, float]
@@ -451,7 +455,7 @@ def test_a_live_dive_is_followed(browser: Browser, tmp_path: Path) -> None:
     try:
         browser.emulate(*SCREEN)
         browser.open(page.address)
-        browser.wait("document.querySelector('#said').innerText.includes('no map yet')")
+        browser.wait("document.querySelector('#said').innerText.includes('no map so far')")
         camera = CameraModel(64, 48, 64.0, 64.0, 32.0, 24.0)
         for turn, rgb in enumerate([(0.8, 0.1, 0.1), (0.1, 0.8, 0.1)]):
             page.show_splats(floor(step=0.2, rgb=rgb))
@@ -469,6 +473,33 @@ def test_a_live_dive_is_followed(browser: Browser, tmp_path: Path) -> None:
         assert browser.text("#caption") == "now"
     finally:
         page.close()
+
+
+def test_a_dive_without_a_map_shows_its_path_and_makes_way_for_the_finished_dive(
+    browser: Browser,
+) -> None:
+    live = ViewerPage(ViewerConfig(port=0), "grows")
+    port = int(live.address.rstrip("/").rpartition(":")[2])
+    try:
+        browser.emulate(*SCREEN)
+        browser.open(live.address)
+        rows = np.array([[x, 0, 0, 1, 0, 0, 0, 1] for x in (0.0, 1.0, 2.0)], np.float32)
+        live.show_path(rows)
+        browser.wait(f"({INK}) > 100")
+        assert not browser.run("return document.querySelector('#tools').checkVisibility()")
+        browser.run("location.hash = '#at=9,9,9&to=0,0,0'")
+    finally:
+        live.close()
+    finished = ViewerPage(ViewerConfig(port=port), "is finished")
+    try:
+        finished.show_path(rows)
+        finished.show_splats(floor(step=0.2))
+        finished.finish()
+        browser.wait("window.aquaflowTimes?.whole && document.title === 'is finished'")
+        assert not browser.run("return location.hash.includes('9,9,9')")
+        assert browser.run("return document.querySelector('#tools').checkVisibility()")
+    finally:
+        finished.close()
 
 
 @pytest.mark.parametrize("width", [390, 800, 1280])

@@ -66,7 +66,8 @@ def strip(tmp_path_factory: pytest.TempPathFactory) -> DiveMap:
 
 @pytest.fixture
 def page(strip: DiveMap) -> Iterator[ViewerPage]:
-    page = ViewerPage(ViewerConfig(port=0), "strip", live=False)
+    page = ViewerPage(ViewerConfig(port=0), "strip")
+    page.finish()
     page.show_packed(strip.packed, lambda: strip.splats, None, strip.palettes)
     yield page
     page.close()

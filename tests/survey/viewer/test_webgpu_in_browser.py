@@ -83,7 +83,8 @@ def mapped(small_dive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 @pytest.fixture(scope="module")
 def flat() -> Iterator[ViewerPage]:
     """A floor at 5 m before the first camera, in water that takes the red; of two chunks."""
-    page = ViewerPage(ViewerConfig(port=0), "floor", live=False)
+    page = ViewerPage(ViewerConfig(port=0), "floor")
+    page.finish()
     plane = floor(step=0.06)
     plane.levels[COVERAGE] = np.where(plane.centres[:, 0] > 0.0, 3, 1).astype(np.uint8)
     water = seen_water([0.5] * 3, [0.0, 0.0, 0.9], [0.5] * 3, [0.0] * 3, [0.5] * 3, [1.0] * 3, 5.0)
@@ -96,7 +97,8 @@ def flat() -> Iterator[ViewerPage]:
 @pytest.fixture(scope="module")
 def near() -> Iterator[ViewerPage]:
     """Gaussians of sigmas to 4000 px, and one whose middle is 1300 px beside the first pose."""
-    page = ViewerPage(ViewerConfig(port=0), "near", live=False)
+    page = ViewerPage(ViewerConfig(port=0), "near")
+    page.finish()
     rotated = [[0.9, 0.1, -0.2, 0.3], [0.8, 0.2, 0.1, -0.4]]
     places = [[0.0, 0.0, 1.0], [0.5, 0.2, 1.2], [3.0, -0.1, 1.1], [-40, -30, 9], [40, 30, 9]]
     turns = [[1, 0, 0, 0], *rotated, [1, 0, 0, 0], [1, 0, 0, 0]]

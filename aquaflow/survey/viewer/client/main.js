@@ -1,6 +1,6 @@
 // The page: asks for the dive, shows it, and joins the parts.
 
-import { add, Eye } from "./camera.js";
+import { add, cross, Eye } from "./camera.js";
 import { Drawing } from "./draw.js";
 import { hands } from "./hands.js";
 import { Link } from "./link.js";
@@ -16,22 +16,26 @@ const ASK_MS = 500; // between two questions for what is new in a live dive
 const find = id => document.getElementById(id);
 const say = text => { find("said").textContent = text; };
 
-let scene = null, drawing = null, detail = null, looking = false, pathShown = -1, loading = false, wrong = "";
+let scene = null, drawing = null, detail = null, looking = false, steered = false, pathShown = -1, loading = false, wrong = "";
 
 const changed = () => {
   if (drawing) drawing.wanted = true;
+  else over();
   if (looking) link.tell();
 };
 // In ms since the address was opened: the script runs, a first chunk is there, a first picture is on
 // the screen, the whole map is drawn. And what a Gaussian costs, and whether nothing is left to draw.
 const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; }, get still() { return drawing?.still; }, get tiles() { return detail?.shown; } };
-const drawn = () => {
+const over = () => {
   marks.camera = line.camera;
+  marks.draw(eye);
+};
+const drawn = () => {
   marks.box = looks.cropWords && looks.box.map((corner, k) => corner.map((v, axis) => {
     const { middle, half } = drawing.about, end = half[axis] * (k ? 1.25 : -1.25);
     return Number.isFinite(v) ? v : middle[axis] + end;
   }));
-  marks.draw(eye);
+  over();
   times.whole = drawing.count === scene.map.count ? times.whole ?? performance.now() : undefined;
 };
 const eye = new Eye([0, -1, 0]), marks = new Marks(find("marks"));
@@ -41,7 +45,7 @@ const link = new Link(eye, line, looks);
 window.aquaflowEye = eye; // for who looks at the page from outside, as its tests do
 
 hands(find("marks"), eye, {
-  changed: () => { drawing.moving = true; line.leave(); changed(); },
+  changed: () => { if (drawing) drawing.moving = true; steered = true; line.leave(); changed(); },
   rested: () => { if (drawing) drawing.moving = false; changed(); },
   pointed: (x, y) => {
     const optics = eye.optics(marks.canvas.clientWidth, marks.canvas.clientHeight);
@@ -50,11 +54,11 @@ hands(find("marks"), eye, {
 });
 new ResizeObserver(changed).observe(find("view"));
 
-// Behind the path and above it, with the map before the eye.
+// Behind the path and above it, with the map before the eye, or without one the path.
 function home() {
-  const { middle, half } = scene.map, size = half[0], path = marks.path;
+  const { middle, half } = scene.map ?? marks.extent, size = half[0], path = marks.path;
   const mean = path.reduce((sum, pose) => add(sum, pose.place, 1 / path.length), [0, 0, 0]);
-  const back = path.length ? add(mean, middle, -1) : eye.up;
+  const back = !path.length ? eye.up : scene.map ? add(mean, middle, -1) : cross([1, 0, 0], eye.up);
   const length = Math.hypot(...back) || 1;
   const place = add(add(middle, back, 1.8 * size / length), eye.up, 0.7 * size);
   line.leave();
@@ -119,7 +123,13 @@ async function showPath(path) {
 }
 
 async function update() {
-  scene = await (await asked("/scene.json")).json();
+  const said = await (await asked("/scene.json")).json();
+  if (scene?.live && !said.live) { // the finished dive has other axes and more tools
+    history.replaceState(null, "", location.pathname);
+    location.reload();
+    return;
+  }
+  scene = said;
   find("health").replaceChildren(...scene.health.split("\n\n").map(text => {
     const part = document.createElement("p");
     part.textContent = text;
@@ -131,11 +141,17 @@ async function update() {
   const coming = due && chunk(scene.map, 0); // on its way while all else is made ready
   await showPath(scene.path);
   line.setScene(scene);
-  if (!scene.map) { say("There is no map yet."); return; }
+  if (!scene.map) {
+    say("There is no map so far.");
+    marks.size = marks.extent.half[0];
+    if (steered || line.beside) over();
+    else home();
+    return;
+  }
   if (!drawing) await begin();
   looks.offer(scene.map, scene.unit, scene.metres);
   if (!looking) {
-    if (!link.follow()) home();
+    if (!link.follow() && !steered) home();
     looking = true;
   }
   const done = due && showMap(scene.map, coming).catch(error => say(error.message));
@@ -147,6 +163,7 @@ async function begin() {
   drawing = await Drawing.on(find("map"), drawn);
   looks.begin(drawing, divider(find("divider"), find("view"), share => { drawing.look.wipe = looks.wiping ? share : null; changed(); }));
   tools.offer(scene.can);
+  for (const id of ["look", "tools"]) find(id).hidden = false;
   find("views").hidden = !scene.can.includes("view");
   const turn = () => { drawing.turn(eye); detail?.look(eye); requestAnimationFrame(turn); };
   requestAnimationFrame(turn);

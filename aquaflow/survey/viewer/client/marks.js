@@ -22,6 +22,14 @@ export class Marks {
     }
   }
 
+  // Middle and half of a cube about the path, with room at its ends.
+  get extent() {
+    const ends = [0, 1, 2].map(k => [Math.min, Math.max].map(end => end(...this.path.map(pose => pose.place[k]))));
+    if (!this.path.length) return { middle: [0, 0, 0], half: [1, 1, 1] };
+    const half = 0.7 * Math.max(...ends.map(([low, high]) => high - low)) || 1;
+    return { middle: ends.map(([low, high]) => (low + high) / 2), half: [half, half, half] };
+  }
+
   draw(eye) {
     const { canvas } = this, ratio = devicePixelRatio;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
