@@ -11,6 +11,7 @@ import gc
 import importlib
 import json
 import os
+import signal
 import sys
 import threading
 import traceback
@@ -62,6 +63,7 @@ def become(command: Command) -> None:
     os.chdir(command["folder"])
     os.environ.clear()
     os.environ.update(command["environment"])
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run behind a "&"
     sys.argv = command["words"]
 
 

@@ -14,7 +14,7 @@ from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.telemetry_input import open_telemetry
 
 if TYPE_CHECKING:
-    from aquaflow.dive.replay import Progress
+    from aquaflow.base.progress import Progress
 
 
 def map_recording(

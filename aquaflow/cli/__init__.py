@@ -5,6 +5,7 @@ Heavy modules load inside the commands, so that ``aquaflow --help`` costs no tor
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import sys
@@ -31,7 +32,16 @@ from aquaflow.cli.doctor import config, doctor_group, inspect
 from aquaflow.cli.export import export_group
 from aquaflow.cli.lab import lab_group
 from aquaflow.cli.measure import measure_group
-from aquaflow.cli.service import exit_code, map_realtime, print_finished, record, run_group, view
+from aquaflow.cli.service import (
+    exit_code,
+    map_realtime,
+    open_preview,
+    print_finished,
+    record,
+    run_group,
+    stay_open,
+    view,
+)
 from aquaflow.cli.site import app as site_group
 
 if TYPE_CHECKING:
@@ -137,6 +147,9 @@ def map_command(
         bool, typer.Option(help="As the live loop would: newest frame only, mapping in parallel.")
     ] = False,
     profile: Annotated[bool, typer.Option(help="Write trace.json for Chrome's tracing.")] = False,
+    in_browser: Annotated[
+        bool, typer.Option("--view", help="Show the dive in a browser as it grows; until Ctrl-C.")
+    ] = False,
     in_site: InSite = None,
     as_json: Json = False,
 ) -> None:
@@ -171,6 +184,11 @@ def map_command(
         )
     if realtime and topic is not None:
         raise ArgumentError("--topic is for a replay; leave out --realtime")
+    if realtime and in_browser:
+        raise ArgumentError(
+            "--view is for a replay; leave out --realtime, or set viewer.enabled in the config of "
+            "`aquaflow run --source`"
+        )
     if in_site is not None:
         checked_site(in_site, out)
     if realtime:
@@ -190,20 +208,28 @@ def map_command(
     with Failures().contain("looking at the first pictures"):
         for clause in blank_at_first(recording, settings.source):
             typer.echo(f"Note: before mapping: {clause}.", err=True)
-    with progress_bars(quiet=as_json) as progress:
-        replayed = map_recording(
-            recording, source.name, out, settings, calibration, overwrite, progress, profile,
-            given, base=None if in_site is None else base_of(in_site), path=source,
-        )  # fmt: skip
-    _print_replayed(replayed, as_json)
+    with contextlib.ExitStack() as around:
+        preview = None
+        if in_browser:
+            preview = around.enter_context(open_preview(settings.mapping.enabled))
+        with progress_bars(quiet=as_json) as progress:
+            replayed = map_recording(
+                recording, source.name, out, settings, calibration, overwrite, progress, profile,
+                given, base=None if in_site is None else base_of(in_site), path=source,
+                preview=preview,
+            )  # fmt: skip
+        _print_replayed(replayed, as_json)
+        if preview is not None and not as_json:
+            stay_open(preview, replayed.dive)
+    raise typer.Exit(exit_code(replayed))
 
 
 def _print_replayed(finished: Finished, as_json: bool) -> None:
-    """Numbers and notes of a dive; ends the command with its exit code."""
+    """Numbers and notes of a dive."""
     metrics = finished.metrics
     if as_json:
         typer.echo(json.dumps({"dive": str(finished.dive), **metrics}))
-        raise typer.Exit(exit_code(finished))
+        return
     for warning in finished.warnings:
         typer.echo(f"Warning: {warning}.")
     quality = (
@@ -222,7 +248,6 @@ def _print_replayed(finished: Finished, as_json: bool) -> None:
         typer.echo(f"Note: {note}.")
     shown = [name for name in ("report.html", "map.ply") if (finished.dive / name).exists()]
     typer.echo(f"Look at {' and '.join(str(finished.dive / name) for name in shown)}.")
-    raise typer.Exit(exit_code(finished))
 
 
 HELP: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, str]]] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from aquaflow.base.errors import ArgumentError, printable_text
+from aquaflow.base.progress import WHOLE, Course
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -122,8 +122,6 @@ LOG_WIDTH = 200
 
 LINE_S = 60.0
 """Between two lines of progress where there is no terminal."""
-WHOLE = "whole"
-"""Stage that counts the seconds of all others, of which it estimates the number."""
 
 
 @contextmanager
@@ -133,7 +131,7 @@ def progress_bars(quiet: bool) -> Iterator[Any]:
     ``WHOLE`` if the command knows it, else of the stage."""
     from rich.console import Console
 
-    course, console = _Course(), Console(stderr=True)
+    course, console = Course(), Console(stderr=True)
     if quiet:
         yield course.advance
     elif console.is_terminal:
@@ -144,48 +142,8 @@ def progress_bars(quiet: bool) -> Iterator[Any]:
             yield course.advance
 
 
-class _Course:
-    """How far a command is."""
-
-    def __init__(self) -> None:
-        self.stage = ""
-        self._done, self._total = 0, 0
-        self._begun, self._begun_s = 0, 0.0
-        self._ends_s: float | None = None
-        self._knows_whole = False
-
-    def advance(self, stage: str, done: int, total: int | None) -> None:
-        """``done`` of the steps of a stage are done."""
-        now_s = time.monotonic()
-        if stage == WHOLE:
-            self._knows_whole, self._ends_s = True, now_s + (total or done) - done
-            return
-        if stage != self.stage:
-            self.stage, self._begun, self._begun_s = stage, done, now_s
-        self._done, self._total = done, total or 0
-        if not self._knows_whole:
-            paced = self._total > 0 and done > self._begun
-            step_s = (now_s - self._begun_s) / max(done - self._begun, 1)
-            self._ends_s = now_s + step_s * (self._total - done) if paced else None
-
-    def left(self) -> str:
-        """The time left, in words; empty while it is unknown."""
-        if self._ends_s is None:
-            return ""
-        left_s = max(self._ends_s - time.monotonic(), 0.0)
-        hours, minutes = divmod(round(left_s / 60.0), 60)
-        if not hours + minutes:
-            return "less than a minute left"
-        return f"about {f'{hours} h ' if hours else ''}{minutes} min left"
-
-    def in_words(self) -> str:
-        """One line."""
-        of = f" of {self._total}" if self._total else ""
-        return "; ".join(filter(None, [f"{self.stage}: {self._done}{of}", self.left()]))
-
-
 @contextmanager
-def _bars(course: _Course, console: Console) -> Iterator[Any]:
+def _bars(course: Course, console: Console) -> Iterator[Any]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     text, left = TextColumn("{task.description:>8}"), TextColumn("{task.fields[left]}")
@@ -207,7 +165,7 @@ def _bars(course: _Course, console: Console) -> Iterator[Any]:
 
 
 @contextmanager
-def _lines(course: _Course) -> Iterator[None]:
+def _lines(course: Course) -> Iterator[None]:
     ended = threading.Event()
 
     def tell() -> None:

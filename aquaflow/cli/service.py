@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import urlsplit
 
 import typer
 
@@ -31,6 +32,7 @@ from aquaflow.cli.console import (
 if TYPE_CHECKING:
     from aquaflow.config import Config
     from aquaflow.config.vehicle import VehicleConfig
+    from aquaflow.dive.preview import Preview
     from aquaflow.dive.run import Finished
     from aquaflow.geometry.camera import CameraModel
     from aquaflow.live.feed import Feed
@@ -191,10 +193,36 @@ def view(
             typer.echo(f"Warning: {said}.", err=True)
     else:
         raise InputError(f"{dive} is no site: only a site has components; leave --component out")
-    typer.echo(f"Open {window.address} in a browser; Ctrl-C ends it.")
+    _wait(window.address)
+    window.close()
+
+
+def _wait(address: str) -> None:
+    typer.echo(f"Open {address} in a browser; Ctrl-C ends it.")
     with contextlib.suppress(KeyboardInterrupt):
         threading.Event().wait()
-    window.close()
+
+
+def open_preview(mapping: bool) -> Preview:
+    """The page of ``map --view``, and where it is; ``mapping``: it will have a map."""
+    from aquaflow.dive.preview import Preview
+
+    preview = Preview()
+    shown = "the map" if mapping else "the path, as without a map there is none,"
+    typer.echo(f"Open {preview.address} in a browser to see {shown} grow.", err=True)
+    return preview
+
+
+def stay_open(preview: Preview, dive: Path) -> None:
+    """The finished dive in place of its preview, or that as it is where there is no map; until
+    Ctrl-C."""
+    preview.finish(dive)
+    if not (dive / "map.ply").exists():
+        _wait(preview.address)
+        return
+    preview.close()
+    with contextlib.suppress(KeyboardInterrupt):
+        view(dive, port=urlsplit(preview.address).port or 0)
 
 
 def _mark(

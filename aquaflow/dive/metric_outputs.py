@@ -108,6 +108,28 @@ def frame_numbers(frame: WorldFrame) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def metric_frame_numbers(frame: WorldFrame) -> dict[str, Any]:
+    """For who looks on: what is known of scale, gravity and north, and why sources are not used."""
+    return {
+        "metric": frame.metric,
+        "metres_per_map_unit": round(frame.T_nm.scale, 5) if frame.metric else None,
+        "scale_sigma": round(frame.scale_sigma, 5) if frame.metric else None,
+        "scale_source": frame.scale_source,
+        "clock_offset_s": round(frame.clock_offset_s, 3),
+        "level": frame.level,
+        "gravity_sigma_deg": (
+            round(float(np.degrees(frame.tilt_sigma_rad)), 3) if frame.level else None
+        ),
+        "north": frame.north,
+        "sources": {
+            f"{source.source} {source.kind}": {
+                "used": source.used, "rejected": source.rejected, "reason": source.reason,
+            }
+            for source in frame.sources
+        },
+    }  # fmt: skip
+
+
 def utc_numbers(navigation: Navigation) -> dict[str, Any]:
     """The keys of metrics.json on UTC, null where no source stated it."""
     clock = navigation.clock

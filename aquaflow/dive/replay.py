@@ -10,12 +10,14 @@ import numpy as np
 
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.progress import WHOLE, Progress
 from aquaflow.base.stages import Profiler, Stages
 from aquaflow.base.worker import usable_threads
 from aquaflow.config import Config, SourceConfig
 from aquaflow.config.stage import MountingConfig
 from aquaflow.dive.calibration_pass import EarlyViews, found_in
 from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.preview import Preview
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.mapping.work import MIN_VIEWS
 from aquaflow.recordings.playback import Event, Playback, read_past_failures
@@ -34,11 +36,6 @@ from aquaflow.tracking.base import Base
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import CameraModel, Dropped, Frame
 
-Progress = Callable[[str, int, int | None], None]
-"""Called with the stage, the steps done and, where known, the steps there are. The stage ``whole``
-counts seconds, those that all stages together take as far as can be told."""
-
-
 TORCH_PRIORS = ("xfeat", "aliked")
 """Kinds of prior that run in torch; a dive without them and without a map does not load it."""
 
@@ -56,9 +53,11 @@ def map_recording(
     settle: Callable[[], None] = lambda: None,
     base: Base | None = None,
     path: Path | None = None,
+    preview: Preview | None = None,
 ) -> Finished:
     """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
-    ``path``: where the recording lies, for the dive to remember.
+    ``path``: where the recording lies, for the dive to remember. ``preview``: shows the dive while
+    it is mapped.
 
     ``settle`` is called at the end of each stage: a benchmark lets it wait for a GPU.
 
@@ -87,11 +86,13 @@ def map_recording(
                     slam.metric.mounting = mounting_of(recording)
             playback = Playback(recording, given.synchronised, failures=failures)
             shown = progress or (lambda stage, done, total: None)
+            if preview is not None:
+                shown = preview.begin(run, shown)
             if calibration is None:
                 _find_camera(run, recording, shown)
             else:
                 run.early_views = EarlyViews(slam)
-            finished = _replay(run, recording, given, playback, config, shown)
+            finished = _replay(run, recording, given, playback, config, shown, preview)
             folder.set_finished()
             return finished
         finally:
@@ -113,7 +114,7 @@ def _find_camera(run: DiveRun, recording: RecordedCamera, progress: Progress) ->
 
 def _replay(
     run: DiveRun, recording: RecordedCamera, telemetry: TelemetryInput, playback: Playback,
-    config: Config, progress: Progress,
+    config: Config, progress: Progress, preview: Preview | None,
 ) -> Finished:  # fmt: skip
     source, count, left = config.source, recording.frame_count, TimeLeft(run, progress)
     stop = count if source.stop is None else min(source.stop, count or source.stop)
@@ -128,6 +129,8 @@ def _replay(
             run.drop(event)
         else:
             decided = run.frame(event)
+            if preview is not None:
+                preview.take(event, decided)
             if any(tracked.frame_class is FrameClass.KEYFRAME for tracked in decided):
                 run.look()
         with run.slam.stages("progress"):
@@ -193,7 +196,7 @@ class TimeLeft:
 
     def _tell(self, left_s: float) -> None:
         so_far_s = time.monotonic() - self._run.started
-        self._progress("whole", round(so_far_s), round(so_far_s + left_s))
+        self._progress(WHOLE, round(so_far_s), round(so_far_s + left_s))
 
 
 def _sources(run: DiveRun, recording: RecordedCamera) -> dict[str, str]:

@@ -116,6 +116,10 @@ class ViewPage(Protocol):
         ...
 
 
+class LiveView(DiveView, ViewPage, Protocol):
+    """A view on a page of its own."""
+
+
 def open_coverage(failures: Failures) -> CoverageView:
     """The entry point ``coverage``; its thread's errors go to ``failures``.
 
@@ -128,17 +132,17 @@ def open_coverage(failures: Failures) -> CoverageView:
 
 def open_viewer(
     config: ViewerConfig, report: Callable[[], dict[str, Any]], coverage: CoverageView | None
-) -> DiveView:
+) -> LiveView:
     """The entry point ``viewer``, listening: map, path and, with ``coverage``, its classes.
 
     Args:
-        report: the service's, as /health has it.
+        report: of a service, as /health has it; of a replay, the keys that it has of them.
 
     Raises:
         InputError: it is not installed, or the address is taken.
         ConfigError: the token will not do.
     """
-    view: DiveView = _load("viewer")(config, report, coverage and coverage.plan)
+    view: LiveView = _load("viewer")(config, report, coverage and coverage.plan)
     return view
 
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow import __version__
 from aquaflow.config.service import ViewerConfig
+from aquaflow.dive.metric_outputs import metric_frame_numbers
 from aquaflow.dive.placement import in_site_numbers
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
@@ -22,7 +23,6 @@ from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import IdleLoop
 from aquaflow.live.vehicle.pose_output import PoseOutput
-from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import KIND_OF, VALUES, Attitude, Position, TelemetrySample, UtcTime
 
 GOOD = (
@@ -147,7 +147,7 @@ def _peak_rss_mb() -> float:
 
 
 # --------------------------------------------------------------------------------------------------
-# What every source of telemetry measures now, and what is known of the map's metric frame.
+# What every source of telemetry measures now.
 
 UNITS = {
     "depth": "m",
@@ -194,25 +194,3 @@ def _value(sample: TelemetrySample) -> float | list[float] | str:
     if isinstance(value, tuple):
         return [round(each, DIGITS) for each in value]
     return round(float(value), DIGITS)
-
-
-def metric_frame_numbers(frame: WorldFrame) -> dict[str, Any]:
-    """Whether scale, gravity and north are known, how well, and why sources are not used."""
-    return {
-        "metric": frame.metric,
-        "metres_per_map_unit": round(frame.T_nm.scale, 5) if frame.metric else None,
-        "scale_sigma": round(frame.scale_sigma, 5) if frame.metric else None,
-        "scale_source": frame.scale_source,
-        "clock_offset_s": round(frame.clock_offset_s, DIGITS),
-        "level": frame.level,
-        "gravity_sigma_deg": (
-            round(float(np.degrees(frame.tilt_sigma_rad)), DIGITS) if frame.level else None
-        ),
-        "north": frame.north,
-        "sources": {
-            f"{source.source} {source.kind}": {
-                "used": source.used, "rejected": source.rejected, "reason": source.reason,
-            }
-            for source in frame.sources
-        },
-    }  # fmt: skip

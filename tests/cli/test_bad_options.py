@@ -141,6 +141,7 @@ def test_values_that_are_offered_can_be_given_as_they_are_offered(
     [
         ("map", "R", "--preset", "moon"),
         ("map", "R", "--realtime", "--topic", "/a"),
+        ("map", "R", "--realtime", "--view"),
         ("map", "R", "--telemetry-offset", "2"),
         ("map", "R", "--in", "D", "--out", "D"),
         ("run",),

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from aquaflow.dive.metric_outputs import metric_frame_numbers
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.feed import LatestSamples
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.report import metric_frame_numbers, newest_values, report
+from aquaflow.live.report import newest_values, report
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import (
     Acceleration,
