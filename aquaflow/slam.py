@@ -98,7 +98,7 @@ class Slam:
             self.metric.motion, self.worker,
         )  # fmt: skip
         adjustment = config.tracking.adjustment
-        self.adjuster = Adjuster(self.keyframes, adjustment)
+        self.adjuster = Adjuster(self.keyframes, adjustment, work)
         """Joint adjustments of keyframes."""
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric,

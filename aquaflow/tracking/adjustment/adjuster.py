@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from time import thread_time
 
 import numpy as np
@@ -38,6 +39,7 @@ from aquaflow.tracking.adjustment.joint import (
     covariance,
     of_edge,
 )
+from aquaflow.tracking.adjustment.stored_matches import MadeMatches
 from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.pose_graph import Edge
@@ -111,8 +113,12 @@ class AdjustmentOutcome:
 class Adjuster:
     """Collects anchored points and links; makes jobs of them."""
 
-    def __init__(self, keyframes: KeyframeStore, config: AdjustmentConfig) -> None:
+    def __init__(
+        self, keyframes: KeyframeStore, config: AdjustmentConfig, work: Path | None = None
+    ) -> None:
+        """What an adjustment of many keyframes has no room for waits in the folder ``work``."""
         self.tally = Tally()
+        self._work = work
         self._keyframes, self._config = keyframes, config
         self._points: dict[int, AnchoredPoints] = {}
         self._links: dict[int, MeasuredLink] = {}
@@ -208,7 +214,7 @@ class Adjuster:
         poses = poses_at(snapshot, nodes)
         self._match(job, {n: poses.element(i) for i, n in enumerate(job.numbers)})
         held = np.array([number in job.held for number in job.numbers], dtype=bool)
-        problem = problem_of(job.numbers, job.points, job.links, poses, held)
+        problem = problem_of(job.numbers, job.points, job.links, poses, held, self._work)
         adjusted = adjust(problem, self._config.iterations)
         found = Improvement.none()
         if adjusted.better:
@@ -293,11 +299,13 @@ def problem_of(
     links: Mapping[int, MeasuredLink],
     poses: Sim3Batch,  # [K] of ``numbers``
     held: Mask,  # [K]
+    folder: Path | None = None,
 ) -> JointProblem:
-    """Everything that is known between the keyframes ``numbers``."""
+    """Everything that is known between the keyframes ``numbers``; ``folder`` as that of a
+    :class:`JointProblem`."""
     place = {number: i for i, number in enumerate(numbers)}
     anchors = [points[number] for number in numbers if number in points]
-    matches = [_matches_of(each, place) for each in anchors]
+    matches = MadeMatches([partial(_matches_of, each, place) for each in anchors])
     inside = [n for n in numbers if n in links and links[n].parent in place]
     return JointProblem(
         matches,
@@ -310,6 +318,7 @@ def problem_of(
         ),
         poses,
         ~held,
+        folder,
     )
 
 

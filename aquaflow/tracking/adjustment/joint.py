@@ -4,8 +4,9 @@ Below: its least-squares problem in blocks, and the uncertainty of what it found
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy import sparse
@@ -27,6 +28,7 @@ from aquaflow.tracking.adjustment.equations import (
     error_lengths,
     project,
 )
+from aquaflow.tracking.adjustment.stored_matches import Judged, Matches, StoredMatches
 
 ROUNDS = 3
 """Of noise and descent; from the second on outliers are left out."""
@@ -46,7 +48,7 @@ LEAST_GAIN = 3.0
 class JointProblem:
     """What is to be adjusted."""
 
-    matches: Sequence[AnchorMatches]
+    matches: Matches
     held_out: Sequence[Mask]
     """[P] of each anchor: points that judge."""
     links: Links
@@ -54,6 +56,8 @@ class JointProblem:
     """[K]"""
     free: Mask
     """[K]"""
+    folder: Path | None = None
+    """For a file of matches that are more than MATCHES_BYTES; None: all stay in memory."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class JointAdjustmentResult:
     """What came of it."""
 
     state: BundleState
-    matches: Sequence[AnchorMatches]
+    matches: Matches
     """Without held-out points and outliers; their noise as found, grown for errors in common."""
     verdict: HeldOutVerdict
 
@@ -78,32 +82,38 @@ def adjust(problem: JointProblem, iterations: int) -> JointAdjustmentResult:
     Raises:
         numpy.linalg.LinAlgError: the equations hold no numbers.
     """
-    judges = [
-        only(each, held) for each, held in zip(problem.matches, problem.held_out, strict=True)
-    ]
-    matches = [
-        only(each, ~held) for each, held in zip(problem.matches, problem.held_out, strict=True)
-    ]
+    matches = StoredMatches.of(
+        (only(each, ~held) for each, held in _with_masks(problem)), problem.folder
+    )
     state = BundleState(problem.poses, [_start_depths(each, problem.poses) for each in matches])
-    matches = [_with_noise(each, state.poses, rho) for each, rho in _each(matches, state)]
+    matches = _judged(matches, _with_noise, state)
     for number in range(ROUNDS):
-        used = matches if number == 0 else [
-            _without_outliers(each, state.poses, rho) for each, rho in _each(matches, state)
-        ]  # fmt: skip
+        used = matches if number == 0 else _judged(matches, _without_outliers, state)
         state = descend(used, problem.links, state, problem.free, iterations)
-        matches = [_with_noise(each, state.poses, rho) for each, rho in _each(matches, state)]
-    used = [_without_outliers(each, state.poses, rho) for each, rho in _each(matches, state)]
-    judges = [replace(judge, sigma=each.sigma) for judge, each in zip(judges, matches, strict=True)]
+        matches = _judged(matches, _with_noise, state)
+    used = _judged(matches, _without_outliers, state)
     grown = float(np.sqrt(inflation(used, problem.links, state, problem.free)))
-    used = [replace(each, sigma=grown * each.sigma) for each in used]
+    used = used.judged_as((grown * sigma, mask) for sigma, mask in used.judged)
+    judges = (
+        replace(only(each, held), sigma=sigma)
+        for (each, held), (sigma, _) in zip(_with_masks(problem), matches.judged, strict=True)
+    )
     state = descend(used, problem.links, state, problem.free, iterations)
     return JointAdjustmentResult(state, used, verdict(judges, problem.poses, state.poses, grown))
 
 
-def _each(
-    matches: Sequence[AnchorMatches], state: BundleState
-) -> list[tuple[AnchorMatches, Array]]:
-    return list(zip(matches, state.rho, strict=True))
+def _with_masks(problem: JointProblem) -> Iterator[tuple[AnchorMatches, Mask]]:
+    return zip(problem.matches, problem.held_out, strict=True)
+
+
+def _judged(
+    matches: StoredMatches,
+    judge: Callable[[AnchorMatches, Sim3Batch, Array], Judged],
+    state: BundleState,
+) -> StoredMatches:
+    """The matches with the noise, and without those that are not used, as ``judge`` finds them."""
+    pairs = zip(matches, state.rho, strict=True)
+    return matches.judged_as(judge(each, state.poses, rho) for each, rho in pairs)
 
 
 def _start_depths(matches: AnchorMatches, poses: Sim3Batch) -> Array:
@@ -118,7 +128,7 @@ def _with_noise(
     matches: AnchorMatches,
     poses: Sim3Batch,
     rho: Array,  # [P]
-) -> AnchorMatches:
+) -> Judged:
     """The noise of every pair's matches from what is left of them; pairs of few are left out."""
     size = error_lengths(matches, poses, rho)
     many = matches.used.sum(axis=1) >= FEW
@@ -126,17 +136,17 @@ def _with_noise(
         max(sigma_of_lengths(row[used]), LEAST_SIGMA) if enough else 1.0
         for row, used, enough in zip(size, matches.used, many, strict=True)
     ])  # fmt: skip
-    return replace(matches, sigma=sigma, used=matches.used & many[:, None])
+    return sigma, matches.used & many[:, None]
 
 
 def _without_outliers(
     matches: AnchorMatches,
     poses: Sim3Batch,
     rho: Array,  # [P]
-) -> AnchorMatches:
+) -> Judged:
     size = error_lengths(matches, poses, rho)
     near = size < OUTLIER_SIGMAS * matches.sigma[:, None]
-    return replace(matches, used=matches.used & near)
+    return matches.sigma, matches.used & near
 
 
 # --------------------------------------------------------------------------------------------------
@@ -148,13 +158,10 @@ REFINEMENTS = 2
 """Gauss-Newton steps from the linear solution: the error is then the least there is."""
 
 
-def held_out_errors(matches: Sequence[AnchorMatches], poses: Sim3Batch) -> list[Array]:
-    """[V, P] lengths of the errors in sigmas of every anchor; NaN where nothing is seen."""
-    errors = []
-    for anchor in matches:
-        size = error_lengths(anchor, poses, triangulate(anchor, poses)) / anchor.sigma[:, None]
-        errors.append(np.where(anchor.used, size, np.nan))
-    return errors
+def held_out_errors(anchor: AnchorMatches, poses: Sim3Batch) -> Array:
+    """[V, P] lengths of the errors in sigmas of an anchor; NaN where nothing is seen."""
+    size = error_lengths(anchor, poses, triangulate(anchor, poses)) / anchor.sigma[:, None]
+    return np.where(anchor.used, size, np.nan)
 
 
 @dataclass(frozen=True)
@@ -171,14 +178,13 @@ class HeldOutVerdict:
 
 
 def verdict(
-    matches: Sequence[AnchorMatches], before: Sim3Batch, after: Sim3Batch, grown: float = 1.0
+    matches: Iterable[AnchorMatches], before: Sim3Batch, after: Sim3Batch, grown: float = 1.0
 ) -> HeldOutVerdict:
     """Compare poses [K] by the matches of points held out of the adjustment; errors in common make
     their standard error ``grown`` times that of independent ones."""
     falls, costs, count = [], np.zeros(2), 0
-    for old, new in zip(
-        held_out_errors(matches, before), held_out_errors(matches, after), strict=True
-    ):
+    for anchor in matches:
+        old, new = held_out_errors(anchor, before), held_out_errors(anchor, after)
         seen = np.isfinite(old) & np.isfinite(new)
         cost = [np.where(seen, KERNEL.cost(np.where(seen, each, 0.0)), 0.0) for each in (old, new)]
         falls.append((cost[0] - cost[1]).sum(0)[seen.any(0)])
@@ -252,7 +258,7 @@ class BundleState:
     """[P] of each anchor."""
 
 
-def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) -> float:
+def cost_of(matches: Matches, links: Links, state: BundleState) -> float:
     """Robust cost of all matches, and of the depths' departure from the pointmaps."""
     total = links.cost(state.poses)
     for anchor, rho in zip(matches, state.rho, strict=True):
@@ -263,7 +269,7 @@ def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) 
 
 
 def descend(
-    matches: Sequence[AnchorMatches],
+    matches: Matches,
     links: Links,
     state: BundleState,
     free: Mask,  # [K] which poses may move
@@ -279,7 +285,7 @@ class JointAdjustment:
 
     def __init__(
         self,
-        matches: Sequence[AnchorMatches],
+        matches: Matches,
         links: Links,
         free: Mask,  # [K]
     ) -> None:
@@ -299,6 +305,7 @@ class JointAdjustment:
 
     def linearise(self, state: BundleState) -> System:
         """The equations of a step [7 F]."""
+        self._system = None  # two of them would be twice KEPT_BYTES
         system = linearise(self._matches, self._links, state, self._pattern)
         self._system = replace(system, cost=self.cost(state))
         return self._system
@@ -347,15 +354,13 @@ class System:
         return step if np.isfinite(step).all() else None
 
 
-def linearise(
-    matches: Sequence[AnchorMatches], links: Links, state: BundleState, pattern: BlockPattern
-) -> System:
+def linearise(matches: Matches, links: Links, state: BundleState, pattern: BlockPattern) -> System:
     """The equations of all anchors and links, summed anchor by anchor."""
     total, kept, room = pattern.zero(), list[AnchorEquations](), KEPT_BYTES
     for anchor, rho in zip(matches, state.rho, strict=True):
         part = anchor_equations(anchor, state.poses, rho)
         total.add(pattern.place[anchor.places], part.H, part.gradient)
-        room -= part.gain.nbytes
+        room -= part.gain.nbytes + part.H.nbytes
         if room >= 0:
             kept.append(part)
     ends = pattern.place[np.stack([links.a, links.b], axis=1)]
@@ -387,7 +392,7 @@ class BlockPattern:
 
     @staticmethod
     def of(
-        matches: Sequence[AnchorMatches],
+        matches: Matches,
         links: Links,
         free: Mask,  # [K]
     ) -> BlockPattern:
@@ -462,7 +467,7 @@ USUAL_INFLATION = 1.8
 
 
 def covariance(
-    matches: Sequence[AnchorMatches],
+    matches: Matches,
     links: Links,
     state: BundleState,
     free: Mask,  # [K]
@@ -477,7 +482,7 @@ def covariance(
 
 
 def inflation(
-    matches: Sequence[AnchorMatches],
+    matches: Matches,
     links: Links,
     state: BundleState,
     free: Mask,  # [K]

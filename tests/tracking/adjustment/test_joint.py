@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,14 @@ from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     anchor_equations,
 )
-from aquaflow.tracking.adjustment.joint import adjust, covariance, triangulate, verdict
+from aquaflow.tracking.adjustment.joint import (
+    System,
+    adjust,
+    covariance,
+    linearise,
+    triangulate,
+    verdict,
+)
 from tests.tracking.adjustment.adjustment_scenes import NOISE, Array, apart, scene, shaken
 
 
@@ -66,6 +75,23 @@ def test_a_dive_too_long_to_keep_its_equations_is_adjusted_to_the_same_bits(
     assert second > first
     assert (kept.poses.t == anew.poses.t).all()
     assert all((a == b).all() for a, b in zip(kept.rho, anew.rho, strict=True))
+
+
+def test_equations_of_two_states_are_never_in_memory_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = scene(count=8)
+    kept: list[weakref.ref[Array]] = []
+
+    def watched(*arguments: Any) -> System:
+        assert [gain for gain in kept if gain() is not None] == []
+        system = linearise(*arguments)
+        kept.extend(weakref.ref(part.gain) for part in system.parts)
+        return system
+
+    monkeypatch.setattr(solver, "linearise", watched)
+    adjust(known.problem(shaken(known.poses, 0.005)), 10)
+    assert len(kept) > 4 * len(known.poses)
 
 
 def test_matches_in_single_precision_are_summed_in_double() -> None:
