@@ -73,7 +73,10 @@ class StoredMatches:
             makers.append(kept or partial(replace, each))
         return StoredMatches(MadeMatches(makers), judged)
 
-    def judged_as(self, judged: Iterable[Judged]) -> StoredMatches:
+    def judged_as(
+        self,
+        judged: Iterable[Judged],  # of each anchor [V] and [V, P]
+    ) -> StoredMatches:
         """The same measurements, and what is thought of them after another look."""
         return replace(self, judged=list(judged))
 

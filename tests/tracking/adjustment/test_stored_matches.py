@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +58,7 @@ def test_what_was_measured_comes_back_and_judgements_follow(
 
 
 def in_precision(each: AnchorMatches, kind: type) -> AnchorMatches:
-    at = each.at.astype(kind)
+    at: Any = each.at.astype(kind)
     return AnchorMatches(
         each.anchor, each.views, each.rays, each.rho, each.variance, at, each.used, each.sigma
     )
@@ -102,7 +104,7 @@ def test_matches_that_are_made_anew_are_not_kept() -> None:
         made.append(number)
         return known.matches[number]
 
-    matches = MadeMatches([lambda n=n: make(n) for n in range(4)])
+    matches = MadeMatches([partial(make, n) for n in range(4)])
     problem = known.problem(shaken(known.poses, 0.005))
     assert len(matches) == 4
     adjusted = adjust(
