@@ -130,7 +130,8 @@ class Packed:
         weight = self._splats.weights().astype(np.float64)
         weight[: self._splats.floaters] = 0.0
         covered = np.cumsum(weight)[[end - 1 for end in self._ends]] if self._ends else np.zeros(0)
-        return (covered / max(float(weight.sum()), 1e-300)).tolist()
+        shares: list[float] = (covered / max(float(weight.sum()), 1e-300)).tolist()
+        return shares
 
     def description(self) -> dict[str, Any]:
         """What a browser needs to read the chunks."""
