@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from aquaflow.config.stage import Lab, StageConfig
 from aquaflow.config.white_balance import CAMERA, require_name
@@ -287,16 +288,48 @@ class DecoderConfig(StageConfig):
     voxels: VoxelConfig = VoxelConfig()
 
 
+BYTES_PER_GAUSSIAN = 600
+"""What one takes of a process on a CPU at its peak: 180 in tables (itself, its keyframe, Adam's
+moments), the rest while tables grow and steps are taken (notes/2026-11-mapping.md#budget)."""
+UNITS = {"MB": 1e6, "GB": 1e9}
+_MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?(MB|GB)")
+
+
+def gaussians_in(value: object) -> object:
+    """As many Gaussians as the memory holds that a text such as ``200 MB`` names; a number as it
+    is.
+
+    Raises:
+        ValueError: the text names none.
+    """
+    if not isinstance(value, str) or value.strip().isdigit():
+        return value
+    match = _MEMORY.fullmatch(value.strip())
+    if match is None:
+        raise ValueError(
+            f"{value[:40]!r} is no number of Gaussians and no memory, such as 200 MB or 1.5 GB"
+        )
+    return int(float(match[1]) * UNITS[match[2]] / BYTES_PER_GAUSSIAN)
+
+
 class MappingConfig(StageConfig):
     """The map (paper, Sec. 3.3 and 3.4)."""
 
     enabled: bool = Field(True, description="False: trajectory only")
     renderer: Literal["auto", "cpu", "tiles", "gsplat", "wgpu"] = "auto"
-    max_gaussians: int = Field(
+    max_gaussians: Annotated[int, BeforeValidator(gaussians_in)] = Field(
         150_000,
         ge=1000,
-        description="of a sub-map in memory; those of ground that is far from what is seen wait in "
-        "files meanwhile (on a CPU, without a decoder), else those of least weight make room",
+        description="of a sub-map in memory, or the memory that they may take, as 200 MB; those of "
+        "ground that is far from what is seen wait in files meanwhile (on a CPU, without a "
+        "decoder), else those of least weight make room",
+    )
+    resolution_mm: float | None = Field(
+        None,
+        gt=0,
+        description="mm on the ground between Gaussians: none is added nearer to another; those "
+        "from before the scale is known in metres stay, and a note says how many; null: as dense "
+        "as structure asks for",
     )
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"

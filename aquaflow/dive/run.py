@@ -6,11 +6,11 @@ import logging
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aquaflow.base.errors import InputError, NotMappedError, printable, times
 from aquaflow.base.stages import pace
@@ -43,6 +43,9 @@ from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.consistency import scale_drift
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
 
 log = logging.getLogger(__name__)
 
@@ -302,6 +305,7 @@ class DiveRun:
                 f"{self.telemetry_log.lost} samples of telemetry are not in {TELEMETRY}: the disk "
                 "was full"
             )
+        self.notes += resolution_notes(self.config.mapping.resolution_mm, self.slam.mappers)
         self.notes += self.slam.tracker.monitor.counts.notes()
         drift = scale_drift(self.slam.graph.snapshot, self.slam.keyframes.keyframes)
         self.notes += [] if drift is None else drift.notes()
@@ -460,6 +464,23 @@ def shortcomings(config: Config, rows: Sequence[FrameRow], gaussians: int) -> li
     if config.mapping.enabled and gaussians == 0:
         found.append(f"the map is empty: it ends with 0 Gaussians; {_what_to_do(config)}")
     return found
+
+
+def resolution_notes(resolution_mm: float | None, mappers: Mapping[int, Mapper]) -> list[str]:
+    """What ``mapping.resolution_mm`` did not limit, and why."""
+    early = sum(mapper.unlimited for mapper in mappers.values())
+    if resolution_mm is None or early == 0:
+        return []
+    asked = f"mapping.resolution_mm, {resolution_mm:g} mm,"
+    if all(mapper.metres_per_unit is None for mapper in mappers.values()):
+        return [
+            f"{asked} had no effect: the map's scale never became known in metres; it takes "
+            "telemetry, such as depth or speed"
+        ]
+    return [
+        f"{asked} does not hold for the {early:,} Gaussians that were added before the map's scale "
+        "was known in metres"
+    ]
 
 
 def _most_common_reason(rows: Sequence[FrameRow], of: str) -> str:

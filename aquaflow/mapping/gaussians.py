@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.config import InsertionConfig
@@ -22,6 +25,8 @@ from aquaflow.render.transfers import (
     pointmap_in,
 )
 from aquaflow.render.views import View
+
+Array: TypeAlias = npt.NDArray[np.floating]
 
 MIN_RADIANCE = 1e-3
 """Darker colours start here: black itself has no finite raw colour."""
@@ -149,7 +154,10 @@ COVERED_ALPHA = 0.6
 SCALE_OF_SPACING = 0.6
 """Sigma of a new Gaussian over the expected spacing."""
 MAX_SPACING_WIDTHS = 0.1
-"""Largest expected spacing over image width."""
+"""Largest expected spacing over image width, where none is asked for."""
+CROWDING = 2.0
+"""Pixels drawn for each square of the spacing that is asked for: of as many, 0.32 are apart
+(Matern's second process), more change little, and later views fill the gaps."""
 
 
 @dataclass(frozen=True)
@@ -258,14 +266,17 @@ def select(
     density: float,
     config: InsertionConfig,
     generator: torch.Generator,
+    spacing_px: Tensor | None = None,  # [H, W]
 ) -> tuple[Tensor, Tensor]:
     """Rows and columns where P_a is above ``tau_a``: all of them, or drawn with probability
-    ``P_a * density``."""
+    ``P_a * density``, and of pixels that are to be a spacing apart not many more than can be."""
     above = probability > config.tau_a
     if config.selection == "threshold":
         drawn = above
     else:
         chance = torch.where(above, probability * density, 0.0)
+        if spacing_px is not None:
+            chance = torch.minimum(chance, CROWDING / spacing_px**2)
         drawn = insertion_in(torch.rand(chance.shape, generator=generator), chance.device) < chance
     rows, columns = torch.nonzero(drawn & allowed, as_tuple=True)
     return rows, columns
@@ -283,6 +294,60 @@ def thin(
     chosen = torch.randperm(len(rows), generator=generator)[: max(room, 0)].sort().values
     chosen = insertion_in(chosen, rows.device)
     return rows[chosen], columns[chosen]
+
+
+def keep_apart(
+    view: View,
+    rows: Tensor,  # [M]
+    columns: Tensor,  # [M]
+    z: Tensor,  # [H, W] range
+    spacing_px: Tensor,  # [H, W]
+    means: Tensor,  # [N, 3] of the map
+    config: InsertionConfig,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """The pixels that are a spacing away from each other and from the map's Gaussians on the same
+    surface. Distances are across the line of sight: along it ranges err by more than a spacing."""
+    if len(rows) == 0:
+        return rows, columns
+    at, ranges = insertion_out(torch.stack([rows, columns], dim=-1)), insertion_out(z)
+    angles = insertion_out(spacing_px[rows, columns]) / view.camera.fx
+    widest = float(angles.max())
+    rays = view.camera.unproject(at[:, ::-1] + 0.5)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    margin_px = widest * view.camera.fx
+    there = _directions_on(view, ranges, insertion_out(means.detach()), margin_px, config.agreement)
+    free = np.ones(len(rays), dtype=bool)
+    if len(there):
+        free = KDTree(there).query(rays)[0] >= angles
+    order = torch.randperm(len(rays), generator=generator).numpy()
+    pairs = KDTree(rays).query_pairs(widest, output_type="ndarray")
+    near = np.linalg.norm(rays[pairs[:, 0]] - rays[pairs[:, 1]], axis=-1)
+    pairs = pairs[(near < angles[pairs].max(axis=1)) & free[pairs].all(axis=1)]
+    later = np.where(order[pairs[:, 0]] > order[pairs[:, 1]], pairs[:, 0], pairs[:, 1])
+    free[later] = False
+    chosen = insertion_in(torch.from_numpy(free), rows.device)
+    return rows[chosen], columns[chosen]
+
+
+def _directions_on(
+    view: View,
+    ranges: Array,  # [H, W]; 0 where unknown
+    means: Array,  # [N, 3] world
+    margin_px: float,
+    agreement: float,
+) -> Array:
+    """[K, 3] unit vectors to the points that lie on the surface that ``view`` sees, or less than
+    a margin beside its picture, at the ranges there up to a share of ``agreement``."""
+    points = (means - view.T_wc.t) @ view.T_wc.R
+    points = points[points[:, 2] > 0.0]
+    at = np.floor(view.camera.project(points))[:, ::-1]
+    last = np.array(ranges.shape) - 1.0
+    inside = ((at >= -margin_px) & (at <= last + margin_px)).all(axis=-1)
+    points, at = points[inside], np.clip(at[inside], 0.0, last).astype(np.intp)
+    lengths, seen = np.linalg.norm(points, axis=-1), ranges[at[:, 0], at[:, 1]]
+    agree = np.abs(lengths - seen) < agreement * seen
+    return np.asarray(points[agree] / lengths[agree, None])
 
 
 def worth_keeping(gaussians: GaussianMap, count: int) -> Tensor:
@@ -307,6 +372,7 @@ def new_gaussians(
     probability: Tensor,  # [H, W] P_a
     density: float,
     config: InsertionConfig,
+    spacing_px: Tensor | None = None,  # [H, W]
 ) -> dict[str, Tensor]:
     """Start values: on the pixel's ray, as wide as the expected spacing, coloured by J-hat.
 
@@ -322,6 +388,8 @@ def new_gaussians(
     if config.selection == "threshold":
         share = torch.ones_like(share)  # neighbours are a pixel apart
     spacing = share.rsqrt().clamp(1.0, MAX_SPACING_WIDTHS * view.camera.width)
+    if spacing_px is not None:
+        spacing = torch.maximum(spacing, spacing_px[rows, columns])
     scale = SCALE_OF_SPACING * spacing * z[rows, columns] / view.camera.fx
     opacity = (config.opacity * confidence[rows, columns]).clamp(0.05, 0.95)
     quats = torch.zeros(len(rows), 4, device=rows.device)

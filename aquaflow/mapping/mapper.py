@@ -21,6 +21,7 @@ from aquaflow.mapping.gaussians import (
     colour_range,
     density_for,
     insertion_probability,
+    keep_apart,
     move_gaussians,
     move_views,
     new_gaussians,
@@ -83,6 +84,10 @@ class Mapper:
         """Of restored pictures, and at how many steps it was judged (appearance.py)."""
         self.depths: Depths | None = None
         """Below the surface; None where they are not known."""
+        self.metres_per_unit: float | None = None
+        """Of the map; None while it is unknown."""
+        self.unlimited = 0
+        """Gaussians that were made before ``resolution_mm`` could limit them."""
         self._failed_in_a_row = 0
         """Steps that raised, since the last one that did not."""
         if config.decoder.enabled:
@@ -153,7 +158,14 @@ class Mapper:
         # Pixels where that is enough, or drawn with that probability.
         allowed = tracked.known & recoverable & view.scene_mask()
         density = density_for(config.density, len(self.gaussians) / self.config.max_gaussians)
-        rows, columns = select(P_a, allowed, density, config, self._random)
+        spacing = self._spacing_px(view, z)
+        rows, columns = select(P_a, allowed, density, config, self._random, spacing)
+
+        # As far apart on the ground as is asked for.
+        if spacing is not None:
+            rows, columns = keep_apart(
+                view, rows, columns, z, spacing, self.gaussians.means, config, self._random
+            )
 
         # Room for them below the hard cap.
         rows, columns = self._make_room(rows, columns, agreed_alpha < COVERED_ALPHA, ground)
@@ -162,8 +174,23 @@ class Mapper:
         if len(rows) == 0:
             return 0
         sure = tracked.confidence
-        new = new_gaussians(view, rows, columns, z, J_hat, sure, P_a, density, config)
+        new = new_gaussians(view, rows, columns, z, J_hat, sure, P_a, density, config, spacing)
+        if spacing is None and self.config.resolution_mm is not None:
+            self.unlimited += len(rows)
         return self._append(new, view)
+
+    def _spacing_px(
+        self,
+        view: View,
+        z: Tensor,  # [H, W]
+    ) -> Tensor | None:
+        """[H, W] between Gaussians, as ``resolution_mm`` asks; None where it says nothing, or the
+        map's unit is not known."""
+        resolution_mm = self.config.resolution_mm
+        if resolution_mm is None or self.metres_per_unit is None:
+            return None
+        spacing = resolution_mm / 1000.0 / self.metres_per_unit
+        return spacing * view.camera.fx / z.clamp_min(1e-6)
 
     def _restore(
         self,
@@ -304,7 +331,8 @@ class Mapper:
         self.water_fitting.follow_moves(moves)
 
     def use_unit(self, metres_per_unit: float) -> None:
-        """The map's unit is known in metres; a decoder's voxels may be given in them."""
+        """The map's unit is known in metres, in which spacing and a decoder's voxels are given."""
+        self.metres_per_unit = metres_per_unit
         if self.neural is not None:
             self.neural.use_unit(metres_per_unit)
 
@@ -325,6 +353,7 @@ class Mapper:
         self.optimiser.extend(count, centres)
         self.optimiser.steps += other.steps
         self.optimiser.undone += other.undone
+        self.unlimited += other.unlimited
         self._find_views_here()
 
     # --- optimising ---------------------------------------------------------------------------

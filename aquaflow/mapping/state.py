@@ -76,6 +76,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "optimiser": optimiser,
         "steps": mapper.steps,
         "undone": mapper.undone,
+        "unlimited": mapper.unlimited,
         "cameras": [of_camera(camera) for camera in cameras],
     }
     arrays = _prefix("gaussians", mapper.gaussians.parameters)
@@ -147,6 +148,7 @@ def deserialise(
             raw, restored = facts[name]
             setattr(scene, name, (float(raw), float(restored)))
     mapper.optimiser.steps, mapper.optimiser.undone = int(facts["steps"]), int(facts["undone"])
+    mapper.unlimited = int(facts.get("unlimited", 0))
     mapper.views = deserialise_views(facts, arrays, device)
     mapper.optimiser.adam.extend(len(gaussians))
     mapper.optimiser.adam.bind(gaussians.parameters)

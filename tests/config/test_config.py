@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.config import Config, StageConfig, load_config, parse_config
+from aquaflow.config.mapping import BYTES_PER_GAUSSIAN
 
 
 def nested(path: str, value: object) -> dict[str, Any]:
@@ -67,6 +68,9 @@ def test_the_config_has_the_stages_that_these_tests_walk() -> None:
         ("tracking.initialisation.max_waiting", 2),
         ("mapping.renderer", "pencil"),
         ("mapping.max_gaussians", 10),
+        ("mapping.max_gaussians", "200 sheep"),
+        ("mapping.max_gaussians", "0.1 MB"),
+        ("mapping.resolution_mm", 0.0),
         ("mapping.hold_out_every", -1),
         ("mapping.insertion.tau_a", 1.1),
         ("mapping.loss.ssim", -0.1),
@@ -78,6 +82,21 @@ def test_the_config_has_the_stages_that_these_tests_walk() -> None:
 def test_a_value_out_of_range_is_named_with_its_path(path: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f"here: '{path.replace('.', '[.]')}[.0-9]*' .+; see"):
         parse_config(nested(path, value), "here")
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        (2000, 2000),
+        ("2000", 2000),
+        ("100 MB", int(1e8 / BYTES_PER_GAUSSIAN)),
+        ("1.5GB", int(1.5e9 / BYTES_PER_GAUSSIAN)),
+    ],
+)
+def test_gaussians_are_given_as_a_number_or_as_memory(given: object, found: int) -> None:
+    config = parse_config(nested("mapping.max_gaussians", given), "here")
+    assert config.mapping.max_gaussians == found
+    assert parse_config(config.model_dump(mode="json"), "again") == config
 
 
 def test_a_stage_that_is_no_mapping_is_named() -> None:

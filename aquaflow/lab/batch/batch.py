@@ -18,6 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.whole_folder import FolderLock, remove_abandoned
 from aquaflow.config import Config
+from aquaflow.config.mapping import BYTES_PER_GAUSSIAN
 from aquaflow.lab.batch.job import WRITTEN, BatchConfig, BatchJob
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
@@ -250,12 +251,10 @@ VIEWS_BYTES_PER_PIXEL = 128 * 11.1
 """128 views in memory; one takes 0.85 MB at 320 x 240 px."""
 KEYFRAMES_BYTES_PER_PIXEL = 32 * 33.9
 """32 keyframes in memory; one takes 0.65 MB at 160 x 120 px."""
-BYTES_PER_GAUSSIAN = 2000.0
-"""What is left of 470 to 580 MB, resident with 80,000 of them at 160 px."""
 MB_PER_FRAME = 0.058
 """At the end of a dive all keyframes are adjusted: 0.48 MB each, at 120 in 1,000 frames."""
-MARGIN = 1.35
-"""Over the sum of the above: measured peaks are at most 1.32 of it (320 px, 20,000 Gaussians)."""
+MARGIN = 1.4
+"""Over the sum of the above: measured peaks are at most 1.38 of it (320 px, 20,000 Gaussians)."""
 DEFAULT_WIDTH = 480
 """px that a recording is mapped at where nothing is asked."""
 USUAL_ASPECT = 0.75
