@@ -14,6 +14,7 @@ import typer
 from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
+    from aquaflow.survey.change.site_refinement import RefinedMap
     from aquaflow.survey.site.merged_file import MergedSite
 
 Site = Annotated[Path, typer.Argument(help="Site folder.")]
@@ -59,16 +60,34 @@ def write_map(
     component: Annotated[
         int | None, typer.Option(help="Its number in `site list`; else the largest.")
     ] = None,
+    refine_steps: Annotated[
+        int,
+        typer.Option(min=0, help="Optimise it so many steps on the pictures of all dives."),
+    ] = 0,
+    refine_seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Longest that this may take, s.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """One map of the merged dives: of each place the dive that shows it last, or more finely."""
     from aquaflow.survey.change.site_map import make_site_map
 
+    refined: RefinedMap | None = None
     with progress_bars(quiet=as_json) as progress, tempfile.TemporaryDirectory() as work:
-        made = make_site_map(site, component, Path(work), progress)
+        if refine_steps:
+            from aquaflow.survey.change.site_refinement import make_refined_map
+
+            made, refined = make_refined_map(
+                site, component, refine_steps, refine_seconds, Path(work), progress
+            )
+        else:
+            made = make_site_map(site, component, Path(work), progress)
     if as_json:
         dives = [asdict(part) for part in made.parts]
         said = {"map": str(made.ply), "dives": dives, "left_out": made.left_out}
+        if refined is not None:
+            in_pictures = [asdict(dive) for dive in refined.dives]
+            said["refined"] = {"steps": refined.steps, "dives": in_pictures}
         typer.echo(json.dumps(said))
         return
     for part in made.parts:
@@ -78,6 +97,8 @@ def write_map(
         )
     for name, reason in made.left_out.items():
         typer.echo(f"Left out: {name}: {reason}.")
+    for line in [] if refined is None else _refinement_in_words(refined):
+        typer.echo(line)
     typer.echo(f"Wrote {made.ply}; `aquaflow view {site}` shows it.")
 
 
@@ -123,6 +144,21 @@ def check(site: Site, as_json: Json = False) -> None:
             typer.echo(finding)
     if found:
         raise typer.Exit(1)
+
+
+def _refinement_in_words(refined: RefinedMap) -> list[str]:
+    lines = [f"Refined in {refined.steps} steps."]
+    for dive in refined.dives:
+        said = f"{dive.views} views"
+        if dive.reason:
+            said = f"nothing was learned from its pictures: {dive.reason}"
+        if dive.psnr_before is not None and dive.psnr_after is not None:
+            said += (
+                f"; {dive.held_out} held-out views {dive.psnr_before:.2f} dB before, "
+                f"{dive.psnr_after:.2f} dB after"
+            )
+        lines.append(f"{dive.name}: {said}.")
+    return lines
 
 
 def _numbers(merged: MergedSite) -> dict[str, Any]:

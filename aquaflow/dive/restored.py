@@ -103,7 +103,7 @@ def seen_frames(dive: Dive, mapper: Mapper, recording: Path | None) -> Iterator[
             yield SeenFrame(view, None, mapper.show(view))
         return
     for view, picture in recorded_pictures(dive, recording, views):
-        yield SeenFrame(_with_picture(view, picture), picture, mapper.show(view))
+        yield SeenFrame(with_picture(view, picture), picture, mapper.show(view))
 
 
 def without_water(mapper: Mapper, seen: SeenFrame) -> RestoredPicture:
@@ -126,7 +126,7 @@ def restored_frames(
         yield seen.view.frame_index, without_water(mapper, seen)
 
 
-def _with_picture(
+def with_picture(
     view: View,
     image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
 ) -> View:

@@ -421,16 +421,24 @@ class Mapper:
                 passed = until.passed
                 if passed >= 1.0:
                     break
-                if step % len(views) == 0:  # light shows once the map has lost its errors
-                    self.scene.sunlight.judge(in_time(views))
-                    self.scene.centre_water(views)
-                done = share_done(step, steps, passed)
-                self.optimiser.slow_down(refining_rates(done, self.config.optimiser))
-                self._contained_step("refinement", view, self.config.optimiser.poses > 0.0)
-                if self._failed_in_a_row == MOST_FAILED_STEPS:
+                if step % len(views) == 0:
+                    self.judge_light(views)
+                if not self.refine_step(view, share_done(step, steps, passed)):
                     break
                 if progress is not None:
                     progress(before + step + 1, whole)
+
+    def judge_light(self, views: Sequence[View]) -> None:
+        """Between rounds of refining ``views``: light shows once the map has lost its errors."""
+        self.scene.sunlight.judge(in_time(views))
+        self.scene.centre_water(views)
+
+    def refine_step(self, view: View, done: float) -> bool:
+        """A step of refining, of which the share ``done`` is over; False where further ones would
+        fail as the last have."""
+        self.optimiser.slow_down(refining_rates(done, self.config.optimiser))
+        self._contained_step("refinement", view, self.config.optimiser.poses > 0.0)
+        return self._failed_in_a_row < MOST_FAILED_STEPS
 
     def _contained_step(self, stage: str, view: View, refine_poses: bool) -> None:
         """The first view's pose is never refined: it fixes the map's frame."""

@@ -95,6 +95,19 @@ class Scene:
         water: WaterParameters = self.medium(R_wc)
         return replace(water, lamp=self.lamp)
 
+    @torch.no_grad()
+    def use_unit_and_light(
+        self,
+        scale: float,
+        gain: Tensor,  # [3]
+    ) -> None:
+        """Let the water be that of a map in which a length of one is ``scale`` and radiances are
+        ``gain`` times as large, before views whose exposures are as much smaller."""
+        self.medium.use_unit_and_light(scale, gain)
+        if self.lamp is not None:
+            self.lamp = replace(self.lamp, range=scale * self.lamp.range)
+        self.exposes = self.exposes or bool((gain != 1.0).any())
+
     def centre_water(self, views: Sequence[View]) -> None:
         """Let the attenuation of ``views`` be on the mean that which the water fit found."""
         if self.medium.directional:

@@ -108,6 +108,19 @@ class LearnedMedium(nn.Module):
         ]
 
     @torch.no_grad()
+    def use_unit_and_light(
+        self,
+        scale: float,
+        gain: Tensor,  # [3]
+    ) -> None:
+        """Let it be the same water where a length of one is ``scale``, and backscatter is ``gain``
+        times as bright."""
+        for raw in (self.output.bias, self.b_raw, self.d_raw):
+            raw.copy_(inverse_softplus(F.softplus(raw) / scale))
+        for logit, bounds in ((self.B_inf_logit, B_INF_RANGE), (self.B_res_logit, GLOW_RANGE)):
+            logit.copy_(torch.logit((torch.sigmoid(logit) * gain).clamp(*bounds)))
+
+    @torch.no_grad()
     def set_water(
         self,
         beta_a: Tensor,  # [3]

@@ -26,12 +26,13 @@ from scipy.spatial import cKDTree
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, read_ply
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.colour_change import DARKEST
 from aquaflow.survey.change.surface import Progress, ViewLookup, look_at_places
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, surfaces_of_map
 from aquaflow.survey.measure.drawn_heights import MATCH_PX
 from aquaflow.survey.site.manifest import check_unchanged, read_site
-from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of
+from aquaflow.survey.site.merged_file import MergedSite, PlacedSubMap, merge_of
 from aquaflow.survey.site.site_map_file import SiteMapPart, names_of, write_site_map
 
 Array = npt.NDArray[np.float64]
@@ -79,6 +80,10 @@ class Part:
     """Gaussians of places that another dive shows later, or more finely."""
     gains: tuple[float, float, float]
     """That its colours were multiplied by."""
+
+    def transform(self, T: Sim3) -> Part:
+        """The same in the world that ``T`` maps to."""
+        return replace(self, gaussians=self.gaussians.transform(T))
 
 
 def combine(days: Sequence[DayMap]) -> list[Part]:
@@ -165,6 +170,15 @@ def _gains(
 
 
 @dataclass(frozen=True)
+class PlacedDive:
+    """A dive of the component that the map is of."""
+
+    folder: Path
+    sub_map: PlacedSubMap
+    """Its largest, whose map counts."""
+
+
+@dataclass(frozen=True)
 class MadeMap:
     """What was written."""
 
@@ -189,8 +203,26 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
     """
     merged = merge_of(site)
     chosen = merged.choose(component, site)
-    days, placed = [], []
-    left_out: dict[str, str] = {}
+    placed, left_out = placed_dives(site, merged, chosen)
+    days = list[DayMap]()
+    for each in list(placed):
+        try:
+            days.append(_day(each, work, progress))
+        except AquaFlowError as error:
+            left_out[each.sub_map.dive] = str(error)
+            placed.remove(each)
+    if not days:
+        raise nothing_left(site, chosen, left_out)
+    parts = combine(days)
+    return write_parts(site, merged, chosen, placed, parts, left_out)
+
+
+def placed_dives(
+    site: Path, merged: MergedSite, chosen: int
+) -> tuple[list[PlacedDive], dict[str, str]]:
+    """The dives of a component in the order of the site, the earliest first, and those that are not
+    what was merged: name and reason."""
+    placed, left_out = list[PlacedDive](), dict[str, str]()
     for dive in read_site(site):
         if dive.name not in merged.fingerprints:
             continue
@@ -200,24 +232,41 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
                 continue
             folder = dive.folder(site)
             check_unchanged(folder, merged.fingerprints[dive.name])
-            days.append(_day(folder, main, work, progress))
-            placed.append(main)
+            placed.append(PlacedDive(folder, main))
         except AquaFlowError as error:
             left_out[dive.name] = str(error)
-    if not days:
-        reasons = "; ".join(left_out.values()) or "no dive has its map there"
-        raise InputError(f"component {chosen} of {site} has nothing to make a map of: {reasons}")
-    parts = combine(days)
+    return placed, left_out
+
+
+def write_parts(
+    site: Path,
+    merged: MergedSite,
+    chosen: int,
+    placed: Sequence[PlacedDive],
+    parts: Sequence[Part],
+    left_out: dict[str, str],
+) -> MadeMap:
+    """Write the one map of ``parts``, one of each placed dive.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
     stated = [
-        _site_map_part(part, main, merged.fingerprints[main.dive])
-        for part, main in zip(parts, placed, strict=True)
+        _site_map_part(part, each.sub_map, merged.fingerprints[each.sub_map.dive])
+        for part, each in zip(parts, placed, strict=True)
     ]
     write_site_map(site, chosen, stated, [part.gaussians for part in parts])
     return MadeMap(names_of(site, chosen)[0], stated, left_out)
 
 
-def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> DayMap:
-    dive = Dive(folder)
+def nothing_left(site: Path, chosen: int, left_out: dict[str, str]) -> InputError:
+    """What a user is told where no dive of a component has a map."""
+    reasons = "; ".join(left_out.values()) or "no dive has its map there"
+    return InputError(f"component {chosen} of {site} has nothing to make a map of: {reasons}")
+
+
+def _day(each: PlacedDive, work: Path, progress: Progress) -> DayMap:
+    dive, placed = Dive(each.folder), each.sub_map
     mapper = dive.filled_map()
     views = surfaces_of_map(mapper, placed.T_sm, work, partial(progress, f"views of {placed.dive}"))
     ply = "map_clear.ply" if dive.has("map_clear.ply") else "map.ply"

@@ -103,3 +103,35 @@ def test_sites_without_a_merge_or_the_component_are_refused(command: Cli, site: 
     assert "components 0 to 0, not 2" in command("site", "map", site, "--component", "2").err
     (site / MERGED).unlink()
     assert "never merged" in command("site", "map", site).err
+
+
+@pytest.mark.ci
+def test_the_one_map_is_refined_on_the_pictures_of_all_dives(
+    command: Cli, site: Path, small_dive: Path
+) -> None:
+    dives = [site.with_name(name) for name in ("monday", "tuesday")]
+    before = [fingerprint(dive) for dive in dives]
+    said = json.loads(command("site", "map", site, "--refine-steps", 60, "--json").out)
+    assert said["refined"]["steps"] == 60
+    for dive, name in zip(said["refined"]["dives"], ("monday", "tuesday"), strict=True):
+        assert dive["name"] == name
+        assert dive["views"] > 10
+        assert dive["held_out"] > 0
+        assert dive["psnr_after"] > dive["psnr_before"] - 0.1
+        assert dive["reason"] == ""
+    whole, own = read_ply(Path(said["map"])), read_ply(small_dive / "map_clear.ply")
+    assert len(whole.means) == sum(part["gaussians"] for part in said["dives"])
+    assert np.abs(np.median(whole.means, axis=0) - np.median(own.means, axis=0)).max() < 0.1
+    assert np.abs(np.median(whole.colours, axis=0) - np.median(own.colours, axis=0)).max() < 0.05
+    assert [fingerprint(dive) for dive in dives] == before
+
+
+@pytest.mark.ci
+def test_a_dive_without_its_recording_costs_only_its_pictures(command: Cli, site: Path) -> None:
+    metrics = site.with_name("monday") / "metrics.json"
+    stated = json.loads(metrics.read_text()) | {"recording": "/nowhere/monday.mp4"}
+    metrics.write_text(json.dumps(stated))
+    told = command("site", "map", site, "--refine-steps", 6, "--refine-seconds", 300).out
+    assert "monday: nothing was learned from its pictures: its recording is not where" in told
+    assert "tuesday: " in told
+    assert "dB after" in told
