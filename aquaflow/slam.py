@@ -109,7 +109,9 @@ class Slam:
         self.in_base: InBase | None = None
         """Where this dive lies in an earlier one; None: none was given."""
         self.maps: MapWork = maps or make_maps(config, self.stages, work, config.mapping.enabled)
-        self._map_inputs = MapInputs(self.maps, self.keyframes, config.mapping, self.metric_frame)
+        self._map_inputs = MapInputs(
+            self.maps, self.keyframes, config.mapping, self.metric_frame, self._base_maps
+        )
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self.frames = FrameTable()
@@ -273,6 +275,10 @@ class Slam:
     def metric_frame(self, sub_map: int) -> WorldFrame:
         """Where a sub-map lies in the world, as far as telemetry has shown it by now."""
         return self.metric.of(sub_map)
+
+    def _base_maps(self, sub_map: int) -> Mapping[Path, Sim3]:
+        """The base's map files in the world of a sub-map, as far as it was recognised by now."""
+        return {} if self.in_base is None else self.in_base.maps(sub_map)
 
     def metric_frames(self) -> dict[int, WorldFrame]:
         """The metric frames by sub-map, after ``finish``: how each world lies in n."""
@@ -515,10 +521,12 @@ class MapInputs:
         keyframes: KeyframeStore,
         config: MappingConfig,
         frame_of: Callable[[int], WorldFrame],
+        base_of: Callable[[int], Mapping[Path, Sim3]],
     ) -> None:
-        """``frame_of`` a sub-map, as last estimated."""
+        """Of a sub-map: its ``frame_of`` the world as last estimated, and ``base_of`` the map files
+        of the base, each with T_mb."""
         self._maps, self._keyframes, self._config = maps, keyframes, config
-        self._frame_of = frame_of
+        self._frame_of, self._base_of = frame_of, base_of
         self._to_hold_out: set[int] = set()
         """Indices of the frames in tracking that the map shall not see."""
         self._views: dict[int, View] = {}
@@ -561,16 +569,20 @@ class MapInputs:
         steps = self._steps(tracked.frame_class)
         frame = self._frame_of(tracked.sub_map)
         unit = frame.T_nm.scale if frame.metric else None
-        return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired), unit)
+        base = self._base_of(tracked.sub_map)
+        return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired), unit, base)
 
     def _retire(self) -> list[Insertion]:
         """The keyframe in use, with its pointmap as fused until now; from here on it is not."""
         retired, self._views = self._views, {}
         keyframes = self._keyframes
         return [
-            Insertion(view, keyframes[number].sub_map, keyframes[number].pointmap)
+            Insertion(
+                view, keyframes[number].sub_map, keyframes[number].pointmap,
+                self._base_of(keyframes[number].sub_map),
+            )
             for number, view in retired.items()
-        ]
+        ]  # fmt: skip
 
     def _steps(self, frame_class: FrameClass) -> int:
         optimiser = self._config.optimiser

@@ -274,7 +274,8 @@ class Deliverables:
 
     def _write_in_site(self) -> None:
         if self.slam.in_base is not None:
-            self.folder.write_json(IN_SITE, in_site(self.slam.in_base, self.slam.keyframes))
+            content = in_site(self.slam.in_base, self.slam.keyframes, self.slam.maps.taken_over)
+            self.folder.write_json(IN_SITE, content)
 
     def _water(self) -> WaterSummary | None:
         """Of the largest sub-map, in the unit of its metric frame."""

@@ -30,7 +30,7 @@ from aquaflow.dive.tum import Trajectory, associate, read_tum
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.keyframes.place import NAME as PLACES
 from aquaflow.keyframes.place import PlacesFile
-from aquaflow.telemetry.metric_file import read_main, read_metric_file
+from aquaflow.telemetry.metric_file import map_name, read_main, read_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
@@ -310,7 +310,7 @@ class Dive:
         return self._maps[number]
 
     def _map_file(self, sub_map: int) -> Path:
-        return self.file(MAP if sub_map == self.main else f"map_{sub_map}.aqf")
+        return self.file(map_name(sub_map, self.main))
 
     def views(self) -> Sequence[View]:
         """The views that the largest sub-map was made from, without pictures; of its Gaussians

@@ -296,11 +296,12 @@ FORMAT = 1
 """Raised whenever an older AquaFlow could no longer read the file."""
 
 
-def in_site(in_base: InBase, keyframes: KeyframeStore) -> dict[str, Any]:
-    """The content of ``in_site.json`` (docs/formats.md#in-site)."""
+def in_site(in_base: InBase, keyframes: KeyframeStore, taken_over: int) -> dict[str, Any]:
+    """The content of ``in_site.json`` (docs/formats.md#in-site); ``taken_over``: Gaussians of the
+    map that began as the base's."""
     return {
         "format": FORMAT,
-        **in_site_numbers(in_base),
+        **in_site_numbers(in_base, taken_over),
         "sub_maps": {
             str(sub_map): _place(in_base, sub_map, links, keyframes)
             for sub_map, links in sorted(in_base.by_sub_map().items())
@@ -308,7 +309,7 @@ def in_site(in_base: InBase, keyframes: KeyframeStore) -> dict[str, Any]:
     }
 
 
-def in_site_numbers(in_base: InBase) -> dict[str, Any]:
+def in_site_numbers(in_base: InBase, taken_over: int) -> dict[str, Any]:
     """The key ``in_site`` of metrics.json, and of /health."""
     first = in_base.first
     return {
@@ -320,10 +321,11 @@ def in_site_numbers(in_base: InBase) -> dict[str, Any]:
         "links": len(in_base.links),
         "refused": in_base.refused,
         "passed_over": in_base.passed_over,
+        "taken_over": taken_over,
     }
 
 
-def in_site_notes(in_base: InBase, keyframes: KeyframeStore) -> list[str]:
+def in_site_notes(in_base: InBase, keyframes: KeyframeStore, taken_over: int) -> list[str]:
     """What the dive came to in the earlier one, for the user; one sentence each."""
     name = in_base.base.name
     if in_base.first is None:
@@ -337,6 +339,11 @@ def in_site_notes(in_base: InBase, keyframes: KeyframeStore) -> list[str]:
         f"{len(in_base.links)} of {in_base.looked_up} keyframes: its files are in the frame of "
         f"{name}"
     ]
+    if taken_over:
+        notes.append(
+            f"{taken_over} Gaussians of the map began as those of {name}, where this dive saw "
+            "their surface"
+        )
     sub_maps = {keyframe.sub_map for keyframe in keyframes.keyframes}
     elsewhere = len(sub_maps - set(in_base.by_sub_map()))
     if elsewhere:

@@ -310,7 +310,8 @@ class DiveRun:
         drift = scale_drift(self.slam.graph.snapshot, self.slam.keyframes.keyframes)
         self.notes += [] if drift is None else drift.notes()
         if self.slam.in_base is not None:
-            self.notes += in_site_notes(self.slam.in_base, self.slam.keyframes)
+            taken_over = self.slam.maps.taken_over
+            self.notes += in_site_notes(self.slam.in_base, self.slam.keyframes, taken_over)
         for note in self.notes:
             log.info(note)
 
@@ -434,7 +435,8 @@ class DiveRun:
         numbers["calibration_check"] = self.calibration_numbers
         numbers["self_calibration"] = None if self.found is None else self.found.to_json()
         in_base = self.slam.in_base
-        numbers["in_site"] = None if in_base is None else in_site_numbers(in_base)
+        taken_over = self.slam.maps.taken_over
+        numbers["in_site"] = None if in_base is None else in_site_numbers(in_base, taken_over)
         numbers["sources"] = self.sources
         numbers["recording"] = None if self.recording is None else str(self.recording.absolute())
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads

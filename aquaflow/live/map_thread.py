@@ -171,6 +171,10 @@ class MapThread:
         return self._maps.mappers
 
     @property
+    def taken_over(self) -> int:
+        return self._maps.taken_over
+
+    @property
     def renderer(self) -> Renderer | None:
         return self._maps.renderer
 

@@ -55,7 +55,9 @@ def report(
         **loop.status(),
         "keyframes": len(parts.slam.keyframes),
         "consistency": parts.slam.tracker.monitor.counts.to_json(),
-        "in_site": None if parts.slam.in_base is None else in_site_numbers(parts.slam.in_base),
+        "in_site": None
+        if parts.slam.in_base is None
+        else in_site_numbers(parts.slam.in_base, parts.maps.taken_over),
         "gaussians": sum(mapper.count for mapper in list(parts.maps.mappers.values())),
         "checkpoint": {
             "taken": parts.checkpointer.taken,

@@ -14,6 +14,7 @@ from aquaflow.config import MappingConfig
 from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.base_gaussians import BaseGaussians
 from aquaflow.mapping.gaussians import (
     COVERED_ALPHA,
     GaussianMap,
@@ -45,6 +46,7 @@ from aquaflow.mapping.scene_water import WaterFitting, rebalance
 from aquaflow.mapping.tiles import KEPT_SHARE, Sphere, TileFiles, Tiles
 from aquaflow.render.contract import Renderer
 from aquaflow.render.gsplat import give_back_after
+from aquaflow.render.transfers import insertion_in, insertion_out
 from aquaflow.render.views import View, in_time
 from aquaflow.water.daylight import Depths
 from aquaflow.water.medium import LearnedMedium
@@ -131,8 +133,16 @@ class Mapper:
             view.begin_on(self.device)
 
     @torch.no_grad()
-    def insert(self, view: View, pointmap: Pointmap) -> int:
-        """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
+    def insert(
+        self,
+        view: View,
+        pointmap: Pointmap,
+        base: Sequence[tuple[BaseGaussians, Sim3]] = (),
+    ) -> int:
+        """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians.
+
+        ``base``: of an earlier dive, each with its T_mb; what of them ``view`` shows comes first.
+        """
         config = self.config.insertion
         self._take(view)
 
@@ -142,6 +152,8 @@ class Mapper:
         tracked = tracked.on(self.device)
         tracked_z = tracked.z * view.T_wc.scale
         ground = self._come_to(view, tracked_z[tracked.known])
+        for gaussians, T_mb in base:  # not in the paper
+            self._take_over(view, tracked_z, gaussians, T_mb, ground)
 
         # J-tilde, alpha and range of the map as it is, drawn from the view.
         shown = self.scene.show(view, learn=True)
@@ -222,6 +234,36 @@ class Mapper:
             self.optimiser.keep(worth_keeping(self.gaussians, count - recycled))
             room += recycled
         return thin(rows, columns, room, self._random)
+
+    def _take_over(
+        self,
+        view: View,
+        tracked_z: Tensor,  # [H, W] map units, 0 where unknown
+        base: BaseGaussians,
+        T_mb: Sim3,
+        ground: Sphere | None,  # what is seen
+    ) -> None:
+        """Of the ``base`` what lies on the surface that ``view`` shows and the map does not."""
+        z = insertion_out(torch.where(view.scene_mask(), tracked_z, 0.0))
+        found = base.on_surface(view, T_mb, torch.from_numpy(z))
+        if found is None:
+            return
+        if len(self.gaussians):
+            shown = self.scene.show(view)
+            agreed = alpha_where_agreed(shown.alpha, shown.z, tracked_z, self.config.insertion)
+            covered = insertion_out(agreed > COVERED_ALPHA)[found.rows, found.columns]
+            base.leave(found.only(covered))
+            found = found.only(~covered)
+        if len(found.numbers) > self.config.max_gaussians - len(self.gaussians):
+            self._let_leave(ground)
+            room = max(self.config.max_gaussians - len(self.gaussians), 0)
+            drawn = torch.randperm(len(found.numbers), generator=self._random)[:room]
+            found = found.only(drawn.numpy())
+        if len(found.numbers) == 0:
+            return
+        J_hat, recoverable = self._restore(view, tracked_z)
+        taken = base.take(found, T_mb, insertion_out(J_hat), insertion_out(recoverable))
+        self._append({n: insertion_in(t, self.device) for n, t in taken.items()}, view)
 
     def _append(
         self,

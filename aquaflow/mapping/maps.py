@@ -23,6 +23,7 @@ from aquaflow.geometry.arrays import (
 )
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import state
+from aquaflow.mapping.base_gaussians import BaseMaps
 from aquaflow.mapping.device_work import DeviceWork
 from aquaflow.mapping.gaussians import move_views
 from aquaflow.mapping.mapper import Mapper
@@ -55,6 +56,7 @@ class Maps:
         self.failures = failures or Failures()
         renderer = renderer or select_renderer(config.mapping.renderer, config.threads)
         self.tiles = TileFiles(work)
+        self._base = BaseMaps(self.failures)
         self._work = DeviceWork(config, renderer, self.failures, self.tiles)
         self.held_out: dict[int, list[View]] = {}
         self.views = ViewStore(work)
@@ -66,6 +68,10 @@ class Maps:
     @property
     def renderer(self) -> Renderer:
         return self._work.renderer
+
+    @property
+    def taken_over(self) -> int:
+        return self._base.taken
 
     def grow(self, growth: Growth) -> None:
         view, number = growth.view, growth.sub_map
@@ -79,7 +85,7 @@ class Maps:
         for retired in growth.retired:
             self.insert(retired)
         if growth.pointmap is not None:
-            self.insert(Insertion(view, number, growth.pointmap))
+            self.insert(Insertion(view, number, growth.pointmap, growth.base))
 
         # Sec. 3.4: joint optimisation of Gaussians and water.
         with self.profiler.stage("optimise"):
@@ -105,8 +111,9 @@ class Maps:
     def insert(self, insertion: Insertion) -> None:
         view, depths = insertion.view, insertion.pointmap
         with self.profiler.stage("insert"):
+            base = self._base.placed(insertion.base)
             self._work.do(
-                "insertion", insertion.sub_map, view.frame_index, Mapper.insert, view, depths
+                "insertion", insertion.sub_map, view.frame_index, Mapper.insert, view, depths, base
             )
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
@@ -181,7 +188,9 @@ class Maps:
 
     def serialise(self) -> tuple[dict[str, Any], Arrays]:
         self.tiles.checkpoint()
-        return serialise(self.mappers, self.held_out)
+        facts, arrays = serialise(self.mappers, self.held_out)
+        facts["base"], waiting = self._base.serialise()
+        return facts, arrays | add_prefix("base", waiting)
 
     def restore(
         self,
@@ -189,6 +198,7 @@ class Maps:
         arrays: Arrays,  # as from serialise
     ) -> None:
         mappers, held_out = restore(facts, arrays, self.renderer, self.failures, self.tiles)
+        self._base.restore(facts.get("base", {}), under("base", arrays))  # not before 2026-11-28
         for number, mapper in mappers.items():
             mapper.views = self.views.restore(mapper.views)
             self.mappers[number] = mapper

@@ -6,7 +6,7 @@ Everything else in ``mapping`` loads torch, 100 MB that a dive without a map doe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -35,6 +35,9 @@ class Insertion:
     view: View
     sub_map: int
     pointmap: Pointmap
+    base: Mapping[Path, Sim3] = field(default_factory=dict)
+    """Map files of the earlier dive that this one was recognised in, each with T_mb from its world
+    to the sub-map's; of those that show the same the first counts."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,8 @@ class Growth:
     """Keyframes that this one relieves, with their pointmaps as fused over their whole life."""
     metres_per_unit: float | None = None
     """Of the sub-map; None while it is unknown."""
+    base: Mapping[Path, Sim3] = field(default_factory=dict)
+    """As of an :class:`Insertion`, for ``pointmap``."""
 
 
 class MapWork(Protocol):
@@ -69,6 +74,11 @@ class MapWork(Protocol):
     @property
     def held_out(self) -> dict[int, list[View]]:
         """Per sub-map, the views that were tracked but never mapped."""
+        ...
+
+    @property
+    def taken_over(self) -> int:
+        """Gaussians that came from the maps of an earlier dive."""
         ...
 
     def grow(self, growth: Growth) -> None:
@@ -162,6 +172,7 @@ class NoMaps:
     """An :class:`aquaflow.mapping.work.OwnedMaps` that never has a map."""
 
     renderer = None
+    taken_over = 0
 
     def __init__(self, profiler: Profiler, failures: Failures) -> None:
         self.profiler, self.failures = profiler, failures

@@ -34,7 +34,7 @@ def write_metric_file(folder: Path, frames: Mapping[int, WorldFrame], main: int)
         ValueError: a number is not finite.
     """
     sub_maps = {
-        str(number): {"map": _map_name(number, main), **frame_to_json(frame)}
+        str(number): {"map": map_name(number, main), **frame_to_json(frame)}
         for number, frame in sorted(frames.items())
     }
     write_json(folder / NAME, {"format": FORMAT, "main": main, "sub_maps": sub_maps})
@@ -68,7 +68,8 @@ def read_frame_of_map(map_file: Path) -> WorldFrame:
     return found[0] if found else WorldFrame.unknown()
 
 
-def _map_name(number: int, main: int) -> str:
+def map_name(number: int, main: int) -> str:
+    """The map file of a sub-map in its dive folder; ``main`` is the sub-map of ``map.aqf``."""
     return "map.aqf" if number == main else f"map_{number}.aqf"
 
 

@@ -27,7 +27,7 @@ from aquaflow.keyframes.place import NAME, KeyframePlace, KeypointDepths, Places
 from aquaflow.optimise.least_squares import NormalEquations, Rules, covariance_of, minimise
 from aquaflow.optimise.robust import Huber
 from aquaflow.prior.contract import Encoding
-from aquaflow.telemetry.metric_file import read_metric_file
+from aquaflow.telemetry.metric_file import map_name, read_main, read_metric_file
 from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.tracking.loops import Retrieval, Verified, verify_keypoints
@@ -209,6 +209,17 @@ class InBase:
                 for sub_map, links in self.by_sub_map().items()
             }
         return self._placed
+
+    def maps(self, sub_map: int) -> dict[Path, Sim3]:
+        """The base's map files in which ``sub_map`` was recognised, the latest dive's first, each
+        with T_mb from its world to the sub-map's; none while it was not."""
+        where = self.places().get(sub_map)
+        if where is None:
+            return {}
+        keyframes = {link.base_keyframe for link in self.by_sub_map()[sub_map]}
+        T_ms = where.T_sm.inverse()
+        found = map(self.base.map_of, sorted(keyframes, reverse=True))
+        return {path: T_ms @ T_sb for path, T_sb in filter(None, found)}
 
     def frame(self, sub_map: int, own: WorldFrame) -> WorldFrame:
         """The base's frame with the place of ``sub_map`` in it; ``own``, by the dive's telemetry,
@@ -469,6 +480,9 @@ class Base:
     """Of a keyframe, by its number; raises InputError where they cannot be read."""
     frames: Mapping[int, WorldFrame]
     """By sub-map: where it lies in n, as the dive's files have it."""
+    map_of: Callable[[int], tuple[Path, Sim3] | None] = lambda _: None
+    """The map file that shows what a keyframe saw, and T_sb from its world to that of the
+    keyframe's sub-map; None where there is no map. Later dives have higher numbers of keyframes."""
 
     @property
     def name(self) -> str:
@@ -533,7 +547,15 @@ def open_base(folder: Path) -> Base:
     file = PlacesFile(folder / NAME)
     if not file.places:
         raise InputError(f"{folder / NAME} holds no place; give another dive to --in")
-    return Base(folder, prior_of(folder), file.places, file.keypoints, read_metric_file(folder))
+    sub_maps, main = {place.number: place.sub_map for place in file.places}, read_main(folder)
+
+    def map_of(number: int) -> tuple[Path, Sim3] | None:
+        path = folder / map_name(sub_maps[number], main)
+        return (path, Sim3.identity()) if path.is_file() else None
+
+    return Base(
+        folder, prior_of(folder), file.places, file.keypoints, read_metric_file(folder), map_of
+    )
 
 
 def prior_of(folder: Path) -> str:

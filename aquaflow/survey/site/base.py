@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
@@ -13,6 +14,7 @@ from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, PlacesFile
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
 from aquaflow.survey.site.merged_file import MergedSite, merge_of
+from aquaflow.telemetry.metric_file import map_name
 from aquaflow.tracking.base import Base, prior_of
 
 log = logging.getLogger(__name__)
@@ -47,9 +49,19 @@ def site_as_base(folder: Path) -> Base | None:
         dive, keyframe = origins[number]
         return files[dive].keypoints(keyframe)
 
+    names = list(merged.fingerprints)
+    placed = {(each.dive, each.number): each.T_sm for each in merged.sub_maps}
+
+    @cache
+    def map_of(number: int) -> tuple[Path, Sim3] | None:
+        name, sub_map = names[origins[number][0]], int(merged.keyframes[number]["sub_map"])
+        dive, T_sm = dives.get(name, folder / name), placed.get((name, sub_map))
+        path = dive / map_name(sub_map, Dive(dive).main)
+        return (path, T_sm) if T_sm is not None and path.is_file() else None
+
     frames = {i: frame_of(stated, dives) for i, stated in enumerate(merged.components)}
     prior = next((p for p in map(prior_of, dives.values()) if p), "")
-    return Base(folder, prior, tuple(places), keypoints, frames)
+    return Base(folder, prior, tuple(places), keypoints, frames, map_of)
 
 
 def _check_unchanged(dive: Path, before: str) -> PlacesFile:

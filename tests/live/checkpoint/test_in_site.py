@@ -64,6 +64,7 @@ def test_a_dive_that_goes_on_is_in_the_site_without_being_asked_again(cut: LiveD
         assert mine.site == "yesterday"
         assert np.allclose(mine.T_nm.matrix, theirs.T_nm.matrix, atol=1e-3)
         assert new.in_base._places._places != []
+        assert new.maps.taken_over == old.maps.taken_over > 0
 
 
 def test_a_dive_keeps_its_place_in_a_site_that_is_gone(cut: LiveDive, base: Path) -> None:

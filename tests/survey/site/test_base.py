@@ -48,4 +48,22 @@ def test_a_dive_that_changed_since_the_merge_is_left_out(site: Path) -> None:
 
 
 def test_a_dive_alone_is_a_base_too(small_dive: Path) -> None:
-    assert base_of(small_dive).name == small_dive.name
+    base = base_of(small_dive)
+    assert base.name == small_dive.name
+    found = base.map_of(base.places[0].number)
+    assert found is not None
+    path, T_sb = found
+    assert path == small_dive / "map.aqf"
+    assert np.allclose(T_sb.matrix, np.eye(4))
+
+
+def test_the_maps_of_a_merged_site_lie_in_its_world(site: Path) -> None:
+    merged = merge(site)
+    base, monday = base_of(site), site.with_name("monday")
+    for place in base.places:
+        found = base.map_of(place.number)
+        assert found is not None
+        assert found[0] == monday / "map.aqf"
+        assert np.allclose(found[1].matrix, merged.sub_maps[0].T_sm.matrix)
+    (monday / "map.aqf").unlink()
+    assert base_of(site).map_of(base.places[0].number) is None
