@@ -127,7 +127,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """What the mappers were asked to do: ("insert", frame) and ("optimise", steps)."""
     made: Calls = []
 
-    def insert(self: Mapper, view: View, pointmap: Pointmap) -> int:
+    def insert(self: Mapper, view: View, pointmap: Pointmap, base: object) -> int:
         made.append(("insert", view.frame_index))
         return 0
 
