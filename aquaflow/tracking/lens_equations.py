@@ -512,5 +512,5 @@ def _choose(
     """Rows of the matches used: first of points that other views see, then an even choice."""
     longer, single = np.flatnonzero(known), np.flatnonzero(~known)
     room = max(0, MATCHES_PER_PAIR - len(longer))
-    step = -(-len(single) // room) if room else len(single) + 1
+    step = max(1, -(-len(single) // room)) if room else len(single) + 1
     return np.concatenate([longer[:: max(1, -(-len(longer) // MATCHES_PER_PAIR))], single[::step]])
