@@ -135,6 +135,7 @@ def test_the_command_writes_into_the_dive_and_says_so(dive: Written) -> None:
     asked = ["export", str(dive[0]), "--format", "restored"]
     result = CliRunner().invoke(app, [*asked, "--json"])
     assert result.exit_code == 0, result.output
-    assert json.loads(result.output) == {"out": str(dive[0] / "restored"), "frames": 3}
+    said = {"out": str(dive[0] / "restored"), "frames": 3, "geotagged": False}
+    assert json.loads(result.output) == said
     assert len(pictures(dive[0] / "restored")) == 3
     assert "3 restored frames" in CliRunner().invoke(app, asked).output

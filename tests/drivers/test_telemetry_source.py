@@ -201,7 +201,7 @@ def test_a_missing_library_is_one_sentence_and_starts_no_thread(monkeypatch, tmp
 
     with pytest.raises(InputError, match=r"'rov' needs the library pymavlink.*aquaflow\[telemetry"):
         LinkTelemetry(parse_telemetry(config, "test"))
-    assert threading.active_count() == before
+    assert threading.active_count() <= before  # one of an earlier test may end meanwhile
 
 
 @pytest.mark.parametrize(
