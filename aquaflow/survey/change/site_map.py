@@ -14,10 +14,12 @@ by one gain per channel, the median ratio over the ground that they share with l
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -31,8 +33,8 @@ from aquaflow.survey.change.colour_change import DARKEST
 from aquaflow.survey.change.surface import Progress, ViewLookup, look_at_places
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, surfaces_of_map
 from aquaflow.survey.measure.drawn_heights import MATCH_PX
-from aquaflow.survey.site.manifest import check_unchanged, read_site
-from aquaflow.survey.site.merged_file import MergedSite, PlacedSubMap, merge_of
+from aquaflow.survey.site.manifest import SiteDive, check_unchanged, read_site
+from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of
 from aquaflow.survey.site.site_map_file import SiteMapPart, names_of, write_site_map
 
 Array = npt.NDArray[np.float64]
@@ -201,68 +203,77 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
         InputError: the site was never merged, none of the dives is left, or the site cannot be
             written to.
     """
-    merged = merge_of(site)
-    chosen = merged.choose(component, site)
-    placed, left_out = placed_dives(site, merged, chosen)
-    days = list[DayMap]()
-    for each in list(placed):
+    dives = ComponentDives(site, component)
+    return dives.write(combine(dives.each(partial(_day, work=work, progress=progress))))
+
+
+Made = TypeVar("Made")
+
+
+class ComponentDives:
+    """The dives of a component of a site that have a part in its map."""
+
+    def __init__(self, site: Path, component: int | None) -> None:
+        """None: the component with most keyframes.
+
+        Raises:
+            InputError: the site was never merged, or has no such component.
+        """
+        self.merged = merge_of(site)
+        self._site, self._number = site, self.merged.choose(component, site)
+        self.placed: list[PlacedDive] = []
+        """In the order of the site, the earliest first."""
+        self._left_out: dict[str, str] = {}
+        for dive in read_site(site):
+            if dive.name in self.merged.fingerprints:
+                with self._leaving_out(dive.name):
+                    self._place(dive)
+
+    def _place(self, dive: SiteDive) -> None:
+        main = self.merged.main_of(dive, self._site)
+        if main is not None and main.component == self._number:
+            folder = dive.folder(self._site)
+            check_unchanged(folder, self.merged.fingerprints[dive.name])
+            self.placed.append(PlacedDive(folder, main))
+
+    @contextmanager
+    def _leaving_out(self, name: str) -> Iterator[None]:
         try:
-            days.append(_day(each, work, progress))
+            yield
         except AquaFlowError as error:
-            left_out[each.sub_map.dive] = str(error)
-            placed.remove(each)
-    if not days:
-        raise nothing_left(site, chosen, left_out)
-    parts = combine(days)
-    return write_parts(site, merged, chosen, placed, parts, left_out)
+            self._left_out[name] = str(error)
 
+    def each(self, make: Callable[[PlacedDive], Made]) -> list[Made]:
+        """What is made of each dive; one for which that raises is left out.
 
-def placed_dives(
-    site: Path, merged: MergedSite, chosen: int
-) -> tuple[list[PlacedDive], dict[str, str]]:
-    """The dives of a component in the order of the site, the earliest first, and those that are not
-    what was merged: name and reason."""
-    placed, left_out = list[PlacedDive](), dict[str, str]()
-    for dive in read_site(site):
-        if dive.name not in merged.fingerprints:
-            continue
-        try:
-            main = merged.main_of(dive, site)
-            if main is None or main.component != chosen:
-                continue
-            folder = dive.folder(site)
-            check_unchanged(folder, merged.fingerprints[dive.name])
-            placed.append(PlacedDive(folder, main))
-        except AquaFlowError as error:
-            left_out[dive.name] = str(error)
-    return placed, left_out
+        Raises:
+            InputError: none is left.
+        """
+        placed, made = self.placed, list[Made]()
+        self.placed = []
+        for dive in placed:
+            with self._leaving_out(dive.sub_map.dive):
+                made.append(make(dive))
+                self.placed.append(dive)
+        if not made:
+            reasons = "; ".join(self._left_out.values()) or "no dive has its map there"
+            raise InputError(
+                f"component {self._number} of {self._site} has nothing to make a map of: {reasons}"
+            )
+        return made
 
+    def write(self, parts: Sequence[Part]) -> MadeMap:
+        """Write the one map of ``parts``, one of each dive.
 
-def write_parts(
-    site: Path,
-    merged: MergedSite,
-    chosen: int,
-    placed: Sequence[PlacedDive],
-    parts: Sequence[Part],
-    left_out: dict[str, str],
-) -> MadeMap:
-    """Write the one map of ``parts``, one of each placed dive.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
-    stated = [
-        _site_map_part(part, each.sub_map, merged.fingerprints[each.sub_map.dive])
-        for part, each in zip(parts, placed, strict=True)
-    ]
-    write_site_map(site, chosen, stated, [part.gaussians for part in parts])
-    return MadeMap(names_of(site, chosen)[0], stated, left_out)
-
-
-def nothing_left(site: Path, chosen: int, left_out: dict[str, str]) -> InputError:
-    """What a user is told where no dive of a component has a map."""
-    reasons = "; ".join(left_out.values()) or "no dive has its map there"
-    return InputError(f"component {chosen} of {site} has nothing to make a map of: {reasons}")
+        Raises:
+            InputError: a file cannot be written.
+        """
+        stated = [
+            _site_map_part(part, each.sub_map, self.merged.fingerprints[each.sub_map.dive])
+            for part, each in zip(parts, self.placed, strict=True)
+        ]
+        write_site_map(self._site, self._number, stated, [part.gaussians for part in parts])
+        return MadeMap(names_of(self._site, self._number)[0], stated, self._left_out)
 
 
 def _day(each: PlacedDive, work: Path, progress: Progress) -> DayMap:

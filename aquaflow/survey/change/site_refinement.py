@@ -30,18 +30,16 @@ from aquaflow.render.image_metrics import psnr
 from aquaflow.render.transfers import picture_out
 from aquaflow.render.views import View, ViewStore, in_time
 from aquaflow.survey.change.site_map import (
+    ComponentDives,
     DayMap,
     MadeMap,
     Part,
     PlacedDive,
     combine,
-    nothing_left,
-    placed_dives,
-    write_parts,
 )
 from aquaflow.survey.change.surface import Progress
 from aquaflow.survey.export.mesh.view_surfaces import surfaces_of_map
-from aquaflow.survey.site.merged_file import MergedSite, merge_of
+from aquaflow.survey.site.merged_file import MergedSite
 from aquaflow.telemetry.metric_file import map_name
 from aquaflow.telemetry.world_frame import WorldFrame
 
@@ -164,26 +162,17 @@ def make_refined_map(
         InputError: the site was never merged, none of the dives is left, or the site cannot be
             written to.
     """
-    merged = merge_of(site)
-    chosen = merged.choose(component, site)
-    placed, left_out = placed_dives(site, merged, chosen)
-    dives, days = list[_JointDive](), list[DayMap]()
-    T_us = placed[-1].sub_map.T_sm.inverse() if placed else Sim3.identity()
-    for each in placed:
-        try:
-            dive = _JointDive(each, merged, T_us)
-            days.append(_day(dive, work, progress))
-            dives.append(dive)
-        except AquaFlowError as error:
-            left_out[each.sub_map.dive] = str(error)
-    if not dives:
-        raise nothing_left(site, chosen, left_out)
+    chosen = ComponentDives(site, component)
+    T_us = chosen.placed[-1].sub_map.T_sm.inverse() if chosen.placed else Sim3.identity()
+
+    def look_at(placed: PlacedDive) -> tuple[_JointDive, DayMap]:
+        dive = _JointDive(placed, chosen.merged, T_us)
+        return dive, _day(dive, work, progress)
+
+    dives, days = zip(*chosen.each(look_at), strict=True)
     refined = _refine(dives, combine(days), steps, Deadline(seconds), work, progress)
     refined = replace(refined, parts=[part.transform(T_us.inverse()) for part in refined.parts])
-    made = write_parts(
-        site, merged, chosen, [dive.placed for dive in dives], refined.parts, left_out
-    )
-    return made, refined
+    return chosen.write(refined.parts), refined
 
 
 def _refine(
