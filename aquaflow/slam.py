@@ -569,7 +569,7 @@ class MapInputs:
         steps = self._steps(tracked.frame_class)
         frame = self._frame_of(tracked.sub_map)
         unit = frame.T_nm.scale if frame.metric else None
-        base = self._base_of(tracked.sub_map)
+        base = {} if tracked.pointmap is None else self._base_of(tracked.sub_map)
         return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired), unit, base)
 
     def _retire(self) -> list[Insertion]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -549,6 +549,7 @@ def open_base(folder: Path) -> Base:
         raise InputError(f"{folder / NAME} holds no place; give another dive to --in")
     sub_maps, main = {place.number: place.sub_map for place in file.places}, read_main(folder)
 
+    @cache
     def map_of(number: int) -> tuple[Path, Sim3] | None:
         path = folder / map_name(sub_maps[number], main)
         return (path, Sim3.identity()) if path.is_file() else None
