@@ -244,7 +244,7 @@ def _sigma_alone(problem: TelemetryProblem, solution: Solution, factor: Factor) 
     for other, information in zip(problem.factors, solution.information, strict=True):
         if other is factor or other.kind not in SCALING:
             A = A + information
-    i = next(i for i, other in enumerate(problem.factors) if other is factor)
+    i = problem.factors.index(factor)
     short = dilution(A, factor, solution.kept[i], solution.information[i])
     return float(np.hypot(np.sqrt(covariance_of(A)[0, 0]), short))
 
@@ -468,7 +468,7 @@ def _of_scales(problem: TelemetryProblem) -> Contradiction | None:
 def _alone(problem: TelemetryProblem, factor: Factor) -> _Alone:
     chosen = [f for f in problem.factors if f is factor or f.kind not in SCALING]
     solution = solve(chosen, problem.start, problem.prior)
-    noise = solution.noise[next(i for i, f in enumerate(chosen) if f is factor)]
+    noise = solution.noise[chosen.index(factor)]
     sheet = float(np.sqrt(np.mean(factor.sigma**2) + factor.slow.least**2 + factor.slow.waves**2))
     variance = float(solution.covariance[SCALE, SCALE][0, 0]) + 0.5 * MAP_SCALE_SIGMA**2
     excess = float(np.hypot(noise.white, noise.size / sheet))
