@@ -169,7 +169,6 @@ def map_command(
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
         COMMAND_LINE,
     )
-    from aquaflow.base.errors import ArgumentError
     from aquaflow.base.errors.failures import Failures
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
@@ -177,18 +176,8 @@ def map_command(
     from aquaflow.sources.telemetry_input import open_telemetry
 
     calibration = None if calib is None else load_camera(calib)
-    if realtime and telemetry:
-        raise ArgumentError(
-            "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
-            "log in a replay.yaml"
-        )
-    if realtime and topic is not None:
-        raise ArgumentError("--topic is for a replay; leave out --realtime")
-    if realtime and in_browser:
-        raise ArgumentError(
-            "--view is for a replay; leave out --realtime, or set viewer.enabled in the config of "
-            "`aquaflow run --source`"
-        )
+    if realtime:
+        _refuse_of_replays(telemetry, topic, in_browser)
     if in_site is not None:
         checked_site(in_site, out)
     if realtime:
@@ -222,6 +211,24 @@ def map_command(
         if preview is not None and not as_json:
             stay_open(preview, replayed.dive)
     raise typer.Exit(exit_code(replayed))
+
+
+def _refuse_of_replays(telemetry: list[Path] | None, topic: str | None, in_browser: bool) -> None:
+    """Refuse, with ``--realtime``, the options that only a replay has."""
+    from aquaflow.base.errors import ArgumentError
+
+    if telemetry:
+        raise ArgumentError(
+            "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
+            "log in a replay.yaml"
+        )
+    if topic is not None:
+        raise ArgumentError("--topic is for a replay; leave out --realtime")
+    if in_browser:
+        raise ArgumentError(
+            "--view is for a replay; leave out --realtime, or set viewer.enabled in the config of "
+            "`aquaflow run --source`"
+        )
 
 
 def _print_replayed(finished: Finished, as_json: bool) -> None:
