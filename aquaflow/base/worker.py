@@ -65,15 +65,17 @@ class Lateness:
         """True while work beside tracking has to give way."""
         return self.times > 1.0
 
-    def rest(self, worked_s: float) -> None:
+    def rest(self, worked_s: float, meanwhile: Callable[[], object] = lambda: None) -> None:
         """After ``worked_s`` of work: rest ``times`` squared as long, if tracking is late, and no
         longer than it is. On two cores at 40 % rests of ``times`` as long left it half a second
-        late for good (notes/2026-11-speed.md#small-computer)."""
+        late for good (notes/2026-11-speed.md#small-computer). ``meanwhile`` is called at each look:
+        it does what cannot wait."""
         if not self.late:
             return
         self.rests += 1
         until = Deadline(min(worked_s * self.times**2, LONGEST_REST_S))
         while self.late and not until.over:
+            meanwhile()
             self._sleep(LOOK_S)
 
 

@@ -93,6 +93,8 @@ class MapThread:
         """Of tracking, to which the thread gives way after each request."""
         self._maps, self._config, self._heartbeats, self._level = maps, config, heartbeats, level
         self._jobs: deque[tuple[str, Job]] = deque()
+        self._inspections: deque[tuple[str, Job]] = deque()
+        """They come before all others, and also while the thread rests."""
         self._growing = 0
         """Growth requests with steps in the queue."""
         self._newest: int | None = None
@@ -144,7 +146,7 @@ class MapThread:
         corrections that tracking has made and the maps do not contain yet."""
         with self._changed:
             lacking = [job for _, job in self._jobs if isinstance(job, MapCorrection)]
-            self._jobs.appendleft((name, lambda maps: job(maps, lacking)))
+            self._inspections.append((name, lambda maps: job(maps, lacking)))
             self._changed.notify()
 
     def later(self, name: str, job: Job) -> None:
@@ -190,7 +192,7 @@ class MapThread:
     @property
     def waiting(self) -> int:
         """Requests in the queue."""
-        return len(self._jobs)
+        return len(self._inspections) + len(self._jobs)
 
     # --- the thread -----------------------------------------------------------------------------
 
@@ -233,7 +235,7 @@ class MapThread:
             began_s = time.monotonic()
             self._do(*job or ("optimise", self._optimise))
             if not self._ending.is_set():
-                self.lateness.rest(time.monotonic() - began_s)
+                self.lateness.rest(time.monotonic() - began_s, meanwhile=self._inspect)
 
     def _give_back_memory(self) -> None:
         level, before = self._level(), self._given_back_at
@@ -246,9 +248,14 @@ class MapThread:
         """The next request; None at once if a map can be optimised meanwhile."""
         with self._changed:
             idle = self.failing or not self._wanting()
-            if not self._jobs and not self._ending.is_set() and idle:
+            if not self.waiting and not self._ending.is_set() and idle:
                 self._changed.wait(IDLE_S)
-            return self._jobs.popleft() if self._jobs else None
+            queue = self._inspections or self._jobs
+            return queue.popleft() if queue else None
+
+    def _inspect(self) -> None:
+        while self._inspections:
+            self._do(*self._inspections.popleft())
 
     def _do(self, name: str, job: Job) -> None:
         # A request that fails (a GPU that is gone, a file that cannot be read) is skipped; so is

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -180,11 +181,23 @@ def test_mapping_rests_while_tracking_is_late_and_goes_on_once_it_is_not(beside:
     beside.lateness.times = 1e6
     beside.hold().set()
     done = threading.Event()
-    beside.thread.inspect("see", lambda maps, lacking: done.set())
+    beside.thread.later("work", lambda maps: done.set())
     assert not done.wait(0.3)
     beside.lateness.times = 1.0
     assert done.wait(20.0)
     assert beside.lateness.rests >= 1
+
+
+def test_a_checkpoint_does_not_wait_until_a_rest_ends(beside: Beside) -> None:
+    held, worked, done = beside.hold(), threading.Event(), threading.Event()
+    beside.lateness.times = 1e6
+    held.set()
+    while not beside.lateness.rests:
+        time.sleep(0.01)
+    beside.thread.later("work", lambda maps: worked.set())
+    beside.thread.inspect("write", lambda maps, lacking: done.set())
+    assert done.wait(2.0)
+    assert not worked.is_set()
 
 
 def test_a_refinement_that_fails_leaves_the_map_as_it_is(

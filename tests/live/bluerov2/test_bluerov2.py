@@ -7,6 +7,7 @@ import os
 import subprocess
 from collections.abc import Iterator
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -92,8 +93,10 @@ def test_a_dead_stream_is_told_once_and_its_return_once(rov: BlueRov2) -> None:
     rov.until(lambda said: said["dive"]["frames"] > frames + MORE, "frames after the silence")
     dead = [text for text in rov.autopilot.texts if "no picture" in text]
     assert dead == ["AquaFlow: no picture from camera pilot."]
+    # A busy computer may track too slowly for a while, and says so by "degraded".
     states = [change["after"] for change in rov.health()["changes"]]
-    assert states[states.index("tracking") :] == ["tracking", "waiting for camera", "tracking"]
+    states = [state for state in states[states.index("tracking") :] if state != "degraded"]
+    assert [state for state, _ in groupby(states)] == ["tracking", "waiting for camera", "tracking"]
 
 
 def test_a_power_cut_costs_no_dive(rov: BlueRov2) -> None:
@@ -107,6 +110,9 @@ def test_a_power_cut_costs_no_dive(rov: BlueRov2) -> None:
     assert folder_of(said) == dive
     frames = said["dive"]["frames"]
     rov.until(lambda said: said["dive"]["frames"] > frames + MOST, "frames after the power cut")
+    # What came after the last checkpoint is lost in the next cut, and a busy computer writes late.
+    written = state_file(dive).stat().st_mtime_ns
+    rov.until(lambda said: state_file(dive).stat().st_mtime_ns > written, "checkpoint")
     rov.kill()
     done = subprocess.run(
         [program(), "run", "finish", str(dive)], capture_output=True, text=True, check=False
