@@ -61,6 +61,11 @@ class Measurements(Protocol):
         """True once there is something."""
         ...
 
+    @property
+    def strained(self) -> bool:
+        """True if keyframes are pulled at: every optimisation solves all of them."""
+        ...
+
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if an optimisation is due."""
         ...
@@ -197,9 +202,7 @@ class KeyframeGraph:
         self._revisited.add(pair)
         information = edge_information(found.covariance, found.scale_sigma, found.T_ke)
         edge = Edge(found.keyframe, found.earlier, found.T_ke, information, loop=True)
-        if self.graph.add_edge(edge):
-            self.loops += 1
-            self._due = True
+        self._close(edge)
         self._optimise()
 
     def straighten(self) -> None:
@@ -328,11 +331,23 @@ class KeyframeGraph:
             sigma = float(np.sqrt(covariance[6, 6]))
             information = edge_information(covariance[:6, :6], sigma, T_fk)
             edge = Edge(number, place.keyframe.number, T_fk, information, loop=True)
-            if self.graph.add_edge(edge):
-                self.loops += 1
-                self._due = self._closed = True
+            if self._close(edge):
+                self._closed = True
                 if self._adjustments is not None:
                     self._adjustments.loop(number, place.keyframe.number)
+
+    def _close(self, loop: Edge) -> bool:
+        """Add a loop edge; False if it was refused. Where telemetry pulls at all keyframes, one
+        that says nothing new waits for its next turn: an area flown again has one for every
+        keyframe, and with 3,300 of them a solution takes 5.6 s (notes/2026-11-speed.md#hour)."""
+        telemetry = self._telemetry
+        pulls = telemetry is not None and telemetry.present and telemetry.strained
+        waits = pulls and self.graph.agrees(loop)
+        if not self.graph.add_edge(loop):
+            return False
+        self.loops += 1
+        self._due |= not waits
+        return True
 
     def _taken_over(self, result: GraphResult) -> Correction:
         """Apply the result to the keyframes."""

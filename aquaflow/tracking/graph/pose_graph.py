@@ -178,6 +178,16 @@ class PoseGraph:
         row = self._row[number]
         return poses_of(self._nodes.rows[row : row + 1])
 
+    def agrees(self, edge: Edge) -> bool:
+        """True if two keyframes of one component are where an edge between them says, within the
+        squared residual that a loop may keep at full trust."""
+        known = edge.a in self._row and edge.b in self._row
+        if not known or self.component_of(edge.a) != self.component_of(edge.b):
+            return False
+        T_ab = self.pose(edge.a).inverse() @ self.pose(edge.b)
+        r = (edge.T_ab.inverse() @ T_ab).log()
+        return bool(r @ edge.information @ r <= self.config.loop_chi2)
+
     def component_of(self, number: int) -> int:
         """The first keyframe of the component that a keyframe belongs to."""
         return int(self._nodes.rows["component"][self._row[number]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent import futures
 from dataclasses import dataclass, field
 from threading import Event
@@ -20,7 +20,7 @@ from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph import keyframe_graph
-from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
+from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph, Measurements
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops import Places, Relocalised
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
@@ -63,6 +63,24 @@ class KnownPlaces:
 
 
 @dataclass
+class Pulling:
+    """Telemetry that pulls at all keyframes, and whose turn comes every so many of them."""
+
+    turn: int
+    strained: bool = True
+    present: bool = True
+
+    def keyframe(self, number: int, parent: int | None) -> bool:
+        return number > 0 and number % self.turn == 0
+
+    def job(self, snapshot: Snapshot) -> Callable[[Snapshot], GraphResult]:
+        return keyframe_graph.solve
+
+    def apply(self) -> None:
+        pass
+
+
+@dataclass
 class Drifting:
     """Keyframes on a circle whose links all err the same way, and the loops that close it."""
 
@@ -70,15 +88,18 @@ class Drifting:
     store: KeyframeStore = field(default_factory=KeyframeStore)
     go_on: Event | None = None
     """If there is one, loops are looked for in a thread, and found once it is set."""
+    telemetry: Measurements | None = None
+    drift: float = 1.0
+    """Error of a link in yaw and scale, in sigmas."""
 
     def __post_init__(self) -> None:
         places = cast(Places, KnownPlaces(self.store, self.loops, self.go_on))
         self.worker = Worker(threads=self.go_on is not None)
-        self.graph = KeyframeGraph(self.store, places, TrackingConfig(), worker=self.worker)
-        self.link_T = [
-            (between(i, i + 1) @ Sim3.exp(SIGMA * np.array([0, 0, 0, 0, 0, 1, 1]))).inverse()
-            for i in range(COUNT - 1)
-        ]
+        self.graph = KeyframeGraph(
+            self.store, places, TrackingConfig(), telemetry=self.telemetry, worker=self.worker
+        )
+        error = Sim3.exp(self.drift * SIGMA * np.array([0, 0, 0, 0, 0, 1, 1]))
+        self.link_T = [(between(i, i + 1) @ error).inverse() for i in range(COUNT - 1)]
 
     def add(self, number: int) -> None:
         link, T_wc = None, Sim3.identity()
@@ -192,6 +213,32 @@ def test_without_a_loop_nothing_is_optimised() -> None:
     for number in range(COUNT):
         dive.add(number)
     assert not dive.graph.optimising
+
+
+@pytest.mark.parametrize(("drift", "solved"), [(0.01, 1), (1.0, 2)])
+def test_a_loop_that_says_nothing_new_waits_for_the_turn_of_telemetry_that_pulls(
+    drift: float, solved: int, held: Held
+) -> None:
+    held.go_on.set()
+    dive = Drifting({14: 0}, telemetry=Pulling(turn=20), drift=drift)
+    for number in range(COUNT):
+        dive.add(number)
+        dive.graph.correction(wait=True)
+    assert dive.graph.loops == 1
+    assert held.solved == [15, 21][-solved:]
+    snapshot = dive.graph.snapshot
+    assert snapshot.trust["trust"][snapshot.edges["loop"]].tolist() == [1.0]
+
+
+def test_where_telemetry_does_not_pull_a_loop_that_says_nothing_new_is_solved_at_once(
+    held: Held,
+) -> None:
+    held.go_on.set()
+    dive = Drifting({14: 0}, telemetry=Pulling(turn=20, strained=False), drift=0.01)
+    for number in range(16):
+        dive.add(number)
+        dive.graph.correction(wait=True)
+    assert held.solved == [15]
 
 
 def test_waiting_at_the_next_keyframe_gives_the_same_poses_however_long_it_took(
