@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.geometry.similarity import rotation_from_quaternion, so3_exp, so3_log
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.start import Process, SlowPart
+from aquaflow.telemetry.start import PossibleNoise, Process, SlowPart
 from aquaflow.telemetry.state import (
     CAMERA,
     CLOCK,
@@ -34,6 +34,7 @@ from aquaflow.telemetry.world_frame import FixErrors
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
 
 MOST = 250
 """Samples of one source that the estimator takes, evenly chosen: what is slow in their errors
@@ -57,10 +58,22 @@ class Factor(ABC):
     """[N] s"""
     sigma: Array
     """[N] white noise, 1 sigma of each component."""
+    _possible_noise: tuple[bytes, PossibleNoise] | None = None
 
     @abstractmethod
     def residuals(self, state: MetricState) -> Array:
         """[N, D]"""
+
+    def possible_noise(
+        self,
+        kept: Mask,  # [N]
+    ) -> PossibleNoise:
+        """The noise that some of its samples may have; kept, since few choices are asked for."""
+        which = kept.tobytes()
+        if self._possible_noise is None or self._possible_noise[0] != which:
+            found = PossibleNoise(self.t_s[kept], self.sigma[kept], self.slow)
+            self._possible_noise = which, found
+        return self._possible_noise[1]
 
     def jacobian(self, state: MetricState) -> Array:
         """[N, D, P] derivatives by a step of the state, by central differences."""

@@ -23,7 +23,7 @@ from aquaflow.optimise.least_squares import (
 )
 from aquaflow.optimise.robust import Cauchy, sigma_of
 from aquaflow.telemetry.factors import Factor
-from aquaflow.telemetry.start import Noise, likeliest
+from aquaflow.telemetry.start import Noise
 from aquaflow.telemetry.state import SCALE, MetricState, P
 from aquaflow.telemetry.world_frame import Origin, SourceReport
 
@@ -35,7 +35,7 @@ ROBUST_ROUNDS, ROUNDS = 3, 3
 RULES = Rules(iterations=12, sigmas=1e-4, damping=1e-9)
 """Of a round; three or four iterations are usual."""
 KERNEL = Cauchy(2.4)
-"""Of single samples; ``likeliest`` finds the noise of those that the gate leaves."""
+"""Of single samples; the likeliest noise is that of those that the gate leaves."""
 GATE = 4.0
 """Sigmas: of ten thousand normal samples one lies beyond."""
 RELINEARISE = 0.05
@@ -81,7 +81,7 @@ def solve(
         residuals = [factor.residuals(found.state) for factor in factors]
         kept = tuple(_gate(f, r) for f, r in zip(factors, residuals, strict=True))
         noise = tuple(
-            likeliest(f.t_s[k], r[k], f.sigma[k], f.slow)
+            f.possible_noise(k).likeliest(r[k])
             for f, r, k in zip(factors, residuals, kept, strict=True)
         )
         correlated = [_Correlated(*each) for each in zip(factors, kept, noise, strict=True)]

@@ -252,27 +252,40 @@ class Noise:
         return base + self.size**2 * self.process.correlation(t_s)
 
 
-def likeliest(
-    t_s: Array,  # [N] s
-    r: Array,  # [N, D] residuals, D components of equal noise
-    sigma: Array,  # [N]
-    part: SlowPart,
-) -> Noise:
-    """The noise under which the residuals are likeliest."""
-    best, found = -np.inf, Noise()
-    base = part.base(t_s, sigma)
-    root = cholesky(base, lower=True)
-    unit = float(np.sqrt(np.trace(base) / max(len(base), 1)))
-    white_r = solve_triangular(root, r, lower=True)
-    for process in part.processes:
-        half = solve_triangular(root, process.correlation(t_s), lower=True)
-        values, vectors = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
-        power = ((vectors.T @ white_r) ** 2).sum(axis=1)
-        sizes = (unit * SIZES) ** 2
-        variance = WHITE[:, None, None] ** 2 + sizes[None, :, None] * np.maximum(values, 0.0)
-        fit = -0.5 * (r.shape[1] * np.log(variance) + power / variance).sum(axis=2)
-        i, j = np.unravel_index(int(np.argmax(fit)), fit.shape)
-        if fit[i, j] > best:
-            best = float(fit[i, j])
-            found = Noise(float(WHITE[i]), unit * float(SIZES[j]), process)
-    return found
+class PossibleNoise:
+    """The noise that residuals at some moments may have; what depends on no residual is found once,
+    for a solution asks in each of its rounds."""
+
+    def __init__(
+        self,
+        t_s: Array,  # [N] s
+        sigma: Array,  # [N]
+        part: SlowPart,
+    ) -> None:
+        base = part.base(t_s, sigma)
+        self._root = cholesky(base, lower=True)
+        self._unit = float(np.sqrt(np.trace(base) / max(len(base), 1)))
+        self._on_top: list[tuple[Process, Array, Array]] = []
+        """Each process with the eigenvalues [N] and vectors [N, N] of its correlation, whitened."""
+        for process in part.processes:
+            half = solve_triangular(self._root, process.correlation(t_s), lower=True)
+            whitened = solve_triangular(self._root, half.T, lower=True)
+            self._on_top.append((process, *np.linalg.eigh(whitened)))
+
+    def likeliest(
+        self,
+        r: Array,  # [N, D] residuals, D components of equal noise
+    ) -> Noise:
+        """The noise under which the residuals are likeliest."""
+        best, found = -np.inf, Noise()
+        white_r = solve_triangular(self._root, r, lower=True)
+        sizes = (self._unit * SIZES) ** 2
+        for process, values, vectors in self._on_top:
+            power = ((vectors.T @ white_r) ** 2).sum(axis=1)
+            variance = WHITE[:, None, None] ** 2 + sizes[None, :, None] * np.maximum(values, 0.0)
+            fit = -0.5 * (r.shape[1] * np.log(variance) + power / variance).sum(axis=2)
+            i, j = np.unravel_index(int(np.argmax(fit)), fit.shape)
+            if fit[i, j] > best:
+                best = float(fit[i, j])
+                found = Noise(float(WHITE[i]), self._unit * float(SIZES[j]), process)
+        return found

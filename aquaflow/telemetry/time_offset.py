@@ -157,6 +157,10 @@ class Refinement:
         whole[used] = residual
         return OffsetFit(x, covariance, model.R_cb(x), middle_s, used, whole, self._seen)
 
+    def fits(self, found: Sequence[OffsetPeak]) -> list[OffsetFit]:
+        """The optima near some peaks; those near which too little is measured are left out."""
+        return [fit for peak in found if (fit := self.fit(peak)) is not None]
+
     def _used_points(self, offset_s: float) -> Mask:
         """[G] grid points whose surroundings were measured by both."""
         start_s, end_s = self._camera.start_s - offset_s, self._camera.end_s - offset_s
@@ -308,6 +312,9 @@ CHANCE_AS_EXPECTED = 1e-3
 """As ``CHANCE_OF_NOTHING``, of the one offset that was expected: a search has hundreds of tries."""
 NEAR_EXPECTED_S = 1.0
 """An offset that a fit finds from the expected one is still that: a quarter of an ROV's sway."""
+RIVAL_LEAVES = 2.0
+"""Times what the search leaves unexplained at the expected offset, beyond which another offset is
+no rival: a fit would have to halve what is left there, and leave it at the expected one."""
 KNOWN_DRIFT = 0.5
 """Share of the prior's sigma below which the overlap has shown the clock's rate."""
 
@@ -400,11 +407,12 @@ def estimate_time_offset(
                 "rotations do not show the time"
             )
     refinement = Refinement(camera, body, sigma_s, mounting_known=R_cb is not None)
-    fits = [fit for peak in peaks(*cells, R_cb) if (fit := refinement.fit(peak)) is not None]
-    found = None
+    tried, found = peaks(*cells, R_cb), None
     if expected_s is not None:
-        found = _as_expected(cells, R_cb, expected_s, refinement, fits, sigma_s)
+        near = peak_at(*cells, R_cb, expected_s)
+        found = _as_expected(near, refinement, tried, sigma_s)
     if found is None:
+        fits = refinement.fits(tried)
         if not fits:
             raise UnlikeError("the log's rotations resemble the video's at no offset")
         best = max(fits, key=lambda fit: fit.gain)
@@ -429,18 +437,15 @@ def _with_any_drift(
 
 
 def _as_expected(
-    cells: tuple[RateSeries, RateSeries],
-    R_cb: Array | None,  # [3, 3]
-    expected_s: float,
-    refinement: Refinement,
-    fits: Sequence[OffsetFit],
-    step_s: float,
+    expected: OffsetPeak, refinement: Refinement, rivals: Sequence[OffsetPeak], step_s: float
 ) -> TimeOffset | None:
     """The offset near the expected one; None where it explains nothing, or another one more."""
-    fit = refinement.fit(peak_at(*cells, R_cb, expected_s))
-    if fit is None or abs(fit.x[OFFSET] - expected_s) > NEAR_EXPECTED_S:
+    fit = refinement.fit(expected)
+    if fit is None or abs(fit.x[OFFSET] - expected.offset_s) > NEAR_EXPECTED_S:
         return None
-    for rival in fits:
+    most = RIVAL_LEAVES * (1.0 - expected.explained)
+    others = [each for each in rivals if abs(each.offset_s - fit.x[OFFSET]) > step_s]
+    for rival in refinement.fits([each for each in others if 1.0 - each.explained <= most]):
         both = fit.used & rival.used
         if rival.gain > fit.gain and _chance(fit.residual, rival, both, step_s) < CHANCE_OF_RIVAL:
             return None

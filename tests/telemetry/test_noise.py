@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import cholesky
 
-from aquaflow.telemetry.start import Noise, Process, SlowPart, likeliest
+from aquaflow.telemetry.start import Noise, PossibleNoise, Process, SlowPart
 
 Array = npt.NDArray[np.float64]
 
@@ -15,6 +15,7 @@ T_S = np.arange(200) * 0.5
 SIGMA = np.full(len(T_S), 0.01)
 DRIFT, LONG_DRIFT, WAVE = Process(5.0), Process(60.0), Process(20.0, 4.0)
 PART = SlowPart(0.001, 60.0, (DRIFT, LONG_DRIFT, WAVE, Process(20.0, 8.5)))
+POSSIBLE = PossibleNoise(T_S, SIGMA, PART)
 DRAWS = 20
 
 
@@ -25,7 +26,7 @@ def drawn(noise: Noise, seed: int, components: int = 1) -> Array:
 
 
 def found(noise: Noise) -> list[Noise]:
-    return [likeliest(T_S, drawn(noise, seed), SIGMA, PART) for seed in range(DRAWS)]
+    return [POSSIBLE.likeliest(drawn(noise, seed)) for seed in range(DRAWS)]
 
 
 @pytest.mark.parametrize("white", [1.0, 3.0, 10.0])
@@ -50,11 +51,11 @@ def test_a_lasting_error_is_recovered_with_its_size_and_its_kind(
 
 def test_all_components_count() -> None:
     r = drawn(Noise(1.0, 0.1, DRIFT), 0, components=3)
-    assert likeliest(T_S, r, SIGMA, PART).size == pytest.approx(0.1, rel=0.3)
+    assert POSSIBLE.likeliest(r).size == pytest.approx(0.1, rel=0.3)
 
 
 def test_noise_is_never_better_than_the_data_sheet() -> None:
-    nothing = likeliest(T_S, np.zeros((len(T_S), 1)), SIGMA, PART)
+    nothing = POSSIBLE.likeliest(np.zeros((len(T_S), 1)))
     assert (nothing.white, nothing.size) == (1.0, 0.0)
     np.testing.assert_allclose(
         nothing.covariance(T_S, SIGMA, PART), PART.base(T_S, SIGMA), atol=1e-15
@@ -74,6 +75,5 @@ def test_a_wave_averages_out_and_a_drift_does_not() -> None:
 
 
 def test_no_samples_leave_the_data_sheet() -> None:
-    assert likeliest(np.zeros(0), np.zeros((0, 1)), np.zeros(0), PART) == Noise(
-        1.0, 0.0, PART.processes[0]
-    )
+    nothing = PossibleNoise(np.zeros(0), np.zeros(0), PART).likeliest(np.zeros((0, 1)))
+    assert nothing == Noise(1.0, 0.0, PART.processes[0])
