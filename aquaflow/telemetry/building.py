@@ -14,9 +14,9 @@ from aquaflow.config.stage import MountingConfig
 from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 from aquaflow.telemetry import start as rough
+from aquaflow.telemetry.altimeter import AltitudeFactor
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors import (
-    AltitudeFactor,
     ConstantDepthFactor,
     DepthFactor,
     Factor,

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import quaternion_from_rotation
+from aquaflow.telemetry.altimeter import AltitudeFactor
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors import (
-    AltitudeFactor,
     ConstantDepthFactor,
     DepthFactor,
     Factor,

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3, Sim3Batch, so3_exp
+from aquaflow.telemetry.altimeter import AltitudeFactor
 from aquaflow.telemetry.estimator import Estimate
 from aquaflow.telemetry.factors import (
-    AltitudeFactor,
     DepthFactor,
     Factor,
     HeadingFactor,
