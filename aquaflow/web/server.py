@@ -104,9 +104,10 @@ class WebServer:
                 dualstack_ipv6=family == socket.AF_INET6 and socket.has_dualstack_ipv6(),
             )  # fmt: skip
         except OSError as error:
+            reason = str(error.strerror).partition(" (while")[0]  # the address once more
             raise InputError(
-                f"cannot listen on {config.host}:{config.port}: {error.strerror}; choose another "
-                f"{key}.port"
+                f"cannot listen on {config.host}:{config.port}: {reason}; choose another port (in "
+                f"a config {key}.port)"
             ) from error
         self.port = int(self._socket.getsockname()[1])
         self.loop = asyncio.new_event_loop()
