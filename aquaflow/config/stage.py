@@ -41,10 +41,11 @@ def validate(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnySta
     except ValidationError as error:
         first = error.errors()[0]
         path = path_of_key(first["loc"])
+        key = f"'{path}' " if path else ""  # empty: keys that do not go together
         unknown = first["type"] == "extra_forbidden"
         problem = "is not a known key" if unknown else words_of(first["msg"])
         kind = ArgumentError if origin == COMMAND_LINE else ConfigError
-        raise kind(f"{origin}: '{path}' {problem}; see `aquaflow config`") from error
+        raise kind(f"{origin}: {key}{problem}; see `aquaflow config`") from error
 
 
 def stages_of(

@@ -10,10 +10,12 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from aquaflow.base.errors import ConfigError, InputError
+from aquaflow.base.errors import ArgumentError, ConfigError, InputError
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.config import Config, StageConfig, load_config, parse_config
 from aquaflow.config.mapping import BYTES_PER_GAUSSIAN
+from aquaflow.config.service import ViewerConfig
+from aquaflow.config.stage import COMMAND_LINE, validate
 
 
 def nested(path: str, value: object) -> dict[str, Any]:
@@ -97,6 +99,11 @@ def test_gaussians_are_given_as_a_number_or_as_memory(given: object, found: int)
     config = parse_config(nested("mapping.max_gaussians", given), "here")
     assert config.mapping.max_gaussians == found
     assert parse_config(config.model_dump(mode="json"), "again") == config
+
+
+def test_keys_that_do_not_go_together_are_told_without_an_empty_name() -> None:
+    with pytest.raises(ArgumentError, match=r"^command line: nowhere\.invalid can be reached"):
+        validate(ViewerConfig, {"enabled": True, "host": "nowhere.invalid"}, COMMAND_LINE)
 
 
 def test_a_stage_that_is_no_mapping_is_named() -> None:
