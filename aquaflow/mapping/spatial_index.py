@@ -80,10 +80,11 @@ class SpatialIndex:
         all N, and in the rest where it is in that."""
         count = len(self._order)
         whole = count - count % CHUNK
-        chosen = rows[rows < whole]
-        missing = -len(chosen) % CHUNK
-        others = np.setdiff1d(np.arange(min(whole, len(chosen) + CHUNK)), chosen)[:missing]
-        return np.concatenate([np.union1d(chosen, others), np.arange(whole, count)])
+        chosen = np.zeros(whole, dtype=bool)  # NumPy's set operations take 100 times as long
+        chosen[rows[rows < whole]] = True
+        missing = -np.count_nonzero(chosen) % CHUNK
+        chosen[np.flatnonzero(~chosen)[:missing]] = True
+        return np.concatenate([np.flatnonzero(chosen), np.arange(whole, count)])
 
     def in_box(
         self,
