@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from aquaflow.render.library import library_or_none
 from aquaflow.survey.export.mesh import atlas as colouring
 from aquaflow.survey.export.mesh import blocks as blocks_module
 from aquaflow.survey.export.mesh.atlas import lay_out, look_at, paint, place_sigmas
-from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Blocks, truncation
+from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, STRIDE_PX, Blocks, truncation
 from aquaflow.survey.export.mesh.surface import DistanceSums, add_by_numpy, add_compiled
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from tests.survey.export.mesh_scenes import (
@@ -175,6 +176,25 @@ def test_a_chunk_has_its_blocks_and_those_in_the_layer_after_it(tmp_path: Path) 
     for chunk in chunks:
         near = ((every >= chunk.corner) & (every <= chunk.corner + side)).all(axis=1)
         np.testing.assert_array_equal(chunk.blocks, every[near])
+
+
+def test_blocks_are_those_that_hold_a_place_or_lie_within_a_voxel_of_it(tmp_path: Path) -> None:
+    poses = around_sphere()[:3]
+    surfaces = surfaces_of(poses, [to_sphere] * len(poses), tmp_path, FAR_CAMERA)
+    found = {
+        tuple(block)
+        for chunk in Blocks(surfaces, VOXEL).chunks()
+        for block in (chunk.blocks // BLOCK).tolist()
+    }
+    expected = set()
+    for number in range(len(surfaces.views)):
+        points, normals, sigmas = surfaces.points(number, STRIDE_PX)
+        for side in (-1.0, 0.0, 1.0):
+            reach = side * truncation(sigmas, VOXEL)[:, None] * normals
+            for away in itertools.product((-1.0, 1.0), repeat=3):
+                places = (points + reach) / VOXEL + away
+                expected |= set(map(tuple, np.floor(places / BLOCK).astype(int).tolist()))
+    assert found == expected
 
 
 def test_the_area_that_is_shown_is_known_to_a_factor_of_two(tmp_path: Path) -> None:
