@@ -121,11 +121,17 @@ class WhiteBalance:
         noise = PICTURE_NOISE**2 + (VEIL_ERROR * veil).square()
         noise = noise + (self.attenuation_sigma * depth * mean * T).square()
         deviation = CONTRAST * mean
-        spread = GREY * deviation[:, None] * deviation + (1.0 - GREY) * torch.diag(deviation**2)
-        seen = T[..., :, None] * spread * T[..., None, :] + torch.diag_embed(noise)
-        G = torch.linalg.solve(seen, T[..., :, None] * spread).mT
-        J = mean + (G @ (image - veil - T * mean)[..., None])[..., 0]
-        own = G.diagonal(dim1=-2, dim2=-1)
+        # A S A + N = diag(alone) + GREY light light^T, solved by Sherman and Morrison's formula.
+        light = T * deviation
+        alone = (1.0 - GREY) * light.square() + noise
+        share = light / alone
+        whole = 1.0 + GREY * (light * share).sum(dim=-1, keepdim=True)
+        left = image - veil - T * mean
+        fit = left / alone - GREY * share * (share * left).sum(dim=-1, keepdim=True) / whole
+        common = (light * fit).sum(dim=-1, keepdim=True)
+        J = mean + deviation * (GREY * common + (1.0 - GREY) * light * fit)
+        single = 1.0 / alone - GREY * share.square() / whole
+        own = deviation * (GREY * share / whole + (1.0 - GREY) * light * single)  # of G, diagonal
         return Recovered(
             (J * white).clamp(0.0, MAX_RESTORED),
             (own * T).mean(dim=-1).clamp(0.0, 1.0),

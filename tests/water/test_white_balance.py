@@ -11,12 +11,18 @@ import torch
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
-from aquaflow.water.medium import WaterParameters
+from aquaflow.water.medium import MAX_RESTORED, WaterParameters
 from aquaflow.water.model import Trial
 from aquaflow.water.nearest import GAINS, Nearest, kept_by, nearest_of
 from aquaflow.water.observations import run_to_end
 from aquaflow.water.sightings import PosedPicture
-from aquaflow.water.white_balance import WhiteBalance
+from aquaflow.water.white_balance import (
+    CONTRAST,
+    GREY,
+    PICTURE_NOISE,
+    VEIL_ERROR,
+    WhiteBalance,
+)
 from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 
 WATER = WaterParameters(
@@ -50,6 +56,36 @@ def test_grey_things_stay_grey_at_any_range_that_light_comes_from() -> None:
     J = 0.4 / GAIN * torch.ones(4, 10, 3)  # grey in the near white balance
     restored = BALANCE.recover(seen(J, z), z, WATER).picture
     assert float((restored - restored.mean(dim=-1, keepdim=True)).abs().max()) < 0.06
+
+
+def recovered_by_matrices(
+    image: torch.Tensor, z: torch.Tensor, water: WaterParameters
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """J-hat before the gain and tr(G A) / 3, by the matrices of the module's text."""
+    T, veil, mean = water.transmission(z), water.backscatter(z), torch.tensor(BALANCE.mean).to(z)
+    depth = water.beta_a * (z[..., None] - BALANCE.near_range).clamp_min(0.0)
+    uncertain = BALANCE.attenuation_sigma * depth * mean * T
+    N = PICTURE_NOISE**2 + (VEIL_ERROR * veil) ** 2 + uncertain**2
+    deviation = CONTRAST * mean
+    S = GREY * torch.outer(deviation, deviation) + (1.0 - GREY) * torch.diag(deviation**2)
+    A = torch.diag_embed(T)
+    G = S @ A @ torch.linalg.inv(A @ S @ A + torch.diag_embed(N))
+    J = (G @ (image - veil)[..., None] + (mean[:, None] - G @ A @ mean[:, None]))[..., 0]
+    return J, (G @ A).diagonal(dim1=-2, dim2=-1).sum(dim=-1) / 3.0
+
+
+def test_the_mean_of_what_may_be_is_that_of_the_matrices() -> None:
+    numbers = (WATER.beta_a, WATER.B_inf, WATER.b, WATER.B_res, WATER.d)
+    water = WaterParameters(*(each.double() for each in numbers))
+    generator = torch.Generator().manual_seed(0)
+    z = torch.rand(9, 11, generator=generator, dtype=torch.float64) * 12.0
+    image = torch.rand(9, 11, 3, generator=generator, dtype=torch.float64)
+    J, confidence = recovered_by_matrices(image, z, water)
+    found = BALANCE.recover(image, z, water)
+    white = torch.tensor(BALANCE.white, dtype=torch.float64)
+    shown = (J * white).clamp(0.0, MAX_RESTORED)
+    torch.testing.assert_close(found.picture, shown, atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(found.confidence, confidence, atol=1e-6, rtol=0.0)
 
 
 def test_where_no_light_comes_back_the_scene_s_mean_stands_in() -> None:
