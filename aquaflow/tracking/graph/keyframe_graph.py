@@ -61,11 +61,6 @@ class Measurements(Protocol):
         """True once there is something."""
         ...
 
-    @property
-    def strained(self) -> bool:
-        """True if keyframes are pulled at: every optimisation solves all of them."""
-        ...
-
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if an optimisation is due."""
         ...
@@ -77,6 +72,15 @@ class Measurements(Protocol):
 
     def apply(self) -> None:
         """The last job's result has been taken over."""
+        ...
+
+
+class PullingMeasurements(Measurements, Protocol):
+    """Measurements that say whether they pull."""
+
+    @property
+    def strained(self) -> bool:
+        """True if keyframes are pulled at: every optimisation solves all of them."""
         ...
 
 
@@ -116,7 +120,7 @@ class KeyframeGraph:
         places: Places,
         config: TrackingConfig,
         failures: Failures | None = None,
-        telemetry: Measurements | None = None,
+        telemetry: PullingMeasurements | None = None,
         adjustments: Adjustments | None = None,
         scales: Measurements | None = None,
         worker: Worker | None = None,
@@ -340,13 +344,12 @@ class KeyframeGraph:
         """Add a loop edge; False if it was refused. Where telemetry pulls at all keyframes, one
         that says nothing new waits for its next turn: an area flown again has one for every
         keyframe, and with 3,300 of them a solution takes 5.6 s (notes/2026-11-speed.md#hour)."""
-        telemetry = self._telemetry
-        pulls = telemetry is not None and telemetry.present and telemetry.strained
-        waits = pulls and self.graph.agrees(loop)
         if not self.graph.add_edge(loop):
             return False
+        telemetry = self._telemetry
+        pulls = telemetry is not None and telemetry.present and telemetry.strained
+        self._due |= not (pulls and self.graph.newest_agrees())
         self.loops += 1
-        self._due |= not waits
         return True
 
     def _taken_over(self, result: GraphResult) -> Correction:

@@ -15,7 +15,7 @@ import numpy as np
 
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3, Sim3Batch
-from aquaflow.tracking.graph.equations import Array, Rows, poses_of
+from aquaflow.tracking.graph.equations import Array, Rows, chi_squares, poses_of, residuals
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import (
     EDGE,
@@ -178,15 +178,12 @@ class PoseGraph:
         row = self._row[number]
         return poses_of(self._nodes.rows[row : row + 1])
 
-    def agrees(self, edge: Edge) -> bool:
-        """True if two keyframes of one component are where an edge between them says, within the
-        squared residual that a loop may keep at full trust."""
-        known = edge.a in self._row and edge.b in self._row
-        if not known or self.component_of(edge.a) != self.component_of(edge.b):
-            return False
-        T_ab = self.pose(edge.a).inverse() @ self.pose(edge.b)
-        r = (edge.T_ab.inverse() @ T_ab).log()
-        return bool(r @ edge.information @ r <= self.config.loop_chi2)
+    def newest_agrees(self) -> bool:
+        """True if the newest edge is a loop within one component, and its keyframes are where it
+        says, within the squared residual that a loop may keep at full trust."""
+        edge, trust = self._edges.rows[-1:], self._trust.rows[-1]
+        r, _ = residuals(poses_of(self._nodes.rows), edge)
+        return bool(trust["trust"] == 0.0 and chi_squares(r, edge)[0] <= trust["allowed"])
 
     def component_of(self, number: int) -> int:
         """The first keyframe of the component that a keyframe belongs to."""

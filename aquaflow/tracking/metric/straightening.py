@@ -280,11 +280,6 @@ class LearnedScales:
         """True once enough keyframes have a scale."""
         return len(self._known) >= LEAST_KEYFRAMES
 
-    @property
-    def strained(self) -> bool:
-        """True: they are never asked whether they pull."""
-        return True
-
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if it is time to look at the scales."""
         found = self._keyframes[number].pointmap.learned

@@ -20,7 +20,7 @@ from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph import keyframe_graph
-from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph, Measurements
+from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph, PullingMeasurements
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops import Places, Relocalised
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
@@ -88,7 +88,7 @@ class Drifting:
     store: KeyframeStore = field(default_factory=KeyframeStore)
     go_on: Event | None = None
     """If there is one, loops are looked for in a thread, and found once it is set."""
-    telemetry: Measurements | None = None
+    telemetry: PullingMeasurements | None = None
     drift: float = 1.0
     """Error of a link in yaw and scale, in sigmas."""
 
