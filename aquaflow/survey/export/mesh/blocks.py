@@ -95,6 +95,8 @@ class Blocks:
             if progress is not None:
                 progress(number + 1, len(surfaces.views))
         self._blocks = _unpack(keys)
+        self._chunks = _distinct(_pack(self._blocks // CHUNK_BLOCKS))
+        """Keys of the chunks that hold a block, ascending."""
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -103,7 +105,7 @@ class Blocks:
     def chunks(self) -> Iterator[Chunk]:
         """Every chunk that holds a block, in a fixed order."""
         chunks, blocks = self._members()
-        for chunk in _unpack(_distinct(_pack(self._blocks // CHUNK_BLOCKS))):
+        for chunk in _unpack(self._chunks):
             key = _pack(chunk[None])[0]
             first, last = np.searchsorted(chunks, (key, key + 1))
             corner = chunk * CHUNK_BLOCKS * BLOCK
@@ -125,7 +127,7 @@ class Blocks:
 
     def chunk_count(self) -> int:
         """How many chunks there are."""
-        return len(_distinct(_pack(self._blocks // CHUNK_BLOCKS)))
+        return len(self._chunks)
 
 
 def _touch(surfaces: ViewSurfaces, number: int, voxel: float) -> Integers:
