@@ -25,6 +25,7 @@ from aquaflow.telemetry.turns import (
     OffsetPeak,
     RateSeries,
     Turns,
+    explained_at_all_offsets,
     peak_at,
     peaks,
     smoothing,
@@ -407,9 +408,10 @@ def estimate_time_offset(
                 "rotations do not show the time"
             )
     refinement = Refinement(camera, body, sigma_s, mounting_known=R_cb is not None)
-    tried, found = peaks(*cells, R_cb), None
+    searched, found = explained_at_all_offsets(*cells, R_cb), None
+    tried = peaks(searched, R_cb)
     if expected_s is not None:
-        near = peak_at(*cells, R_cb, expected_s)
+        near = peak_at(searched, R_cb, expected_s)
         found = _as_expected(near, refinement, tried, sigma_s)
     if found is None:
         fits = refinement.fits(tried)

@@ -253,11 +253,18 @@ class OffsetPeak:
     """Share of the camera's turning, all of it, that the telemetry predicts; at most 1."""
 
 
-def peaks(camera: RateSeries, body: RateSeries, R_cb: Array | None) -> list[OffsetPeak]:  # [3, 3]
+Searched = tuple[Array, Array, Array]
+"""Share explained [L] (-inf where the overlap is short), H [L, 3, 3], offsets [L] in s."""
+
+
+def peaks(
+    searched: Searched,  # [L], [L, 3, 3], [L]
+    R_cb: Array | None,  # [3, 3]
+) -> list[OffsetPeak]:
     """The best offset and its rivals, best first; empty where none explains anything."""
     from scipy.signal import find_peaks  # half a second, for the dives that have logs
 
-    explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
+    explained, H, offsets_s = searched
     if not len(explained) or not np.isfinite(explained).any() or explained.max() <= 0.0:
         return []
     floor = np.concatenate([[0.0], np.maximum(explained, 0.0), [0.0]])
@@ -274,13 +281,12 @@ def peaks(camera: RateSeries, body: RateSeries, R_cb: Array | None) -> list[Offs
 
 
 def peak_at(
-    camera: RateSeries,
-    body: RateSeries,
+    searched: Searched,  # [L], [L, 3, 3], [L]
     R_cb: Array | None,  # [3, 3]
     offset_s: float,
 ) -> OffsetPeak:
     """One offset, however much it explains."""
-    explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
+    explained, H, offsets_s = searched
     near = int(np.argmin(np.abs(offsets_s - offset_s)))
     R = nearest_rotation(H[near]) if R_cb is None else R_cb
     return OffsetPeak(offset_s, R, float(explained[near]))
@@ -290,8 +296,8 @@ def explained_at_all_offsets(
     camera: RateSeries,
     body: RateSeries,
     R_cb: Array | None,  # [3, 3]
-) -> tuple[Array, Array, Array]:
-    """Share explained [L] (-inf where the overlap is short), H [L, 3, 3], offsets [L] in s."""
+) -> Searched:
+    """How well each offset explains the camera's turns by the body's."""
     from scipy.signal import correlate
 
     v, g, mv, mg = camera.rate_rad_s, body.rate_rad_s, camera.measured, body.measured
