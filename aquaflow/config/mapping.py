@@ -199,7 +199,10 @@ class OptimiserConfig(StageConfig):
     )
     steps_common: Lab[int] = Field(2, ge=0, description="steps after a common frame (ARTDECO: 10)")
     refine_steps: int = Field(
-        800, ge=0, description="steps after the last frame (notes/2026-11-mapping.md#refining)"
+        800,
+        ge=0,
+        description="steps after the last frame, for every max_gaussians of the map "
+        "(notes/2026-11-mapping.md#refining)",
     )
     refine_seconds: float | None = Field(
         None,

@@ -188,8 +188,9 @@ class TimeLeft:
     def _ending_s(self, step_s: float) -> float:
         """What is left after the last frame, where a step of refining takes so long."""
         optimiser = self._run.config.mapping.optimiser
-        maps = sum(len(each.views) >= MIN_VIEWS for each in self._run.slam.mappers.values())
-        left_s = step_s * max(maps * optimiser.refine_steps - self._refined, 0)
+        maps = self._run.slam.mappers.values()
+        steps = sum(each.refining_steps for each in maps if len(each.views) >= MIN_VIEWS)
+        left_s = step_s * max(steps - self._refined, 0)
         if optimiser.refine_seconds is not None:
             left_s = min(left_s, max(optimiser.refine_seconds - step_s * self._refined, 0.0))
         return left_s + step_s * ENDING_STEPS

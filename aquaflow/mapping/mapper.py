@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -412,6 +414,13 @@ class Mapper:
             for view in chosen:
                 self._contained_step("optimisation", view, refine_poses=False)
 
+    @property
+    def refining_steps(self) -> int:
+        """Steps of the final refinement: those asked for, for as much of the map as has room in
+        memory, so that the ground of a long dive gets what that of a short one does."""
+        parts = max(self.count / self.config.max_gaussians, 1.0)
+        return round(self.config.optimiser.refine_steps * parts)
+
     def refine(
         self,
         progress: Callable[[int, int], None] | None = None,
@@ -420,43 +429,41 @@ class Mapper:
         """The final refinement: all views in random order, rates falling, poses included; as much
         of it as there is time ``until`` then."""
         self.scene.go_on()
-        steps, until = self.config.optimiser.refine_steps, until or Deadline()
-        if not (until.over or self.tiles.waiting):
-            self.water_fitting.at_once(self.views)
-        if not self.tiles.waiting:
-            self._refine_views(self.views, 0, steps, progress, until)
+        steps, until = self.refining_steps, until or Deadline()
+        done = itertools.count(1)
+
+        def stepped() -> None:
+            if progress is not None:
+                progress(next(done), steps)
+
+        if self.tiles.waiting:
+            self._refine_by_turns(steps, stepped, until)
         else:
-            self._refine_by_turns(steps, progress, until)
+            if not until.over:
+                self.water_fitting.at_once(self.views)
+            self._refine_views(self.views, steps, stepped, until)
         with self.failures.contain("white balance"):
             rebalance(self.scene)
 
-    def _refine_by_turns(
-        self, steps: int, progress: Callable[[int, int], None] | None, until: Deadline
-    ) -> None:
-        """Ground after ground, in the order in which the dive saw it, each as long as its share of
-        the views."""
-        done, refined, whole = 0, set[int](), len(self.views)
-        for keyframe in sorted({view.keyframe for view in self.views} & self.tiles.seen.keys()):
-            if keyframe in refined:
-                continue
+    def _refine_by_turns(self, steps: int, stepped: Callable[[], None], until: Deadline) -> None:
+        """Ground after ground, in the order in which the dive saw it, each with its share of steps
+        and time by its views."""
+        views = Counter(view.keyframe for view in self.views if view.keyframe in self.tiles.seen)
+        whole, done = views.total(), 0
+        while views and not until.over:
+            keyframe, left = min(views), views.total()
             self._fill_around(self.tiles.seen[keyframe])
             here = self.views if self._here is None else self._here
-            turn = [view for view in here if view.keyframe not in refined]
-            refined |= {keyframe, *(view.keyframe for view in turn)}
-            share = round(steps * sum(view.keyframe in refined for view in self.views) / whole)
-            self._refine_views(turn, done, share - done, progress, until)
-            done = share
+            turn = [view for view in here if view.keyframe in views]
+            for each in {keyframe, *(view.keyframe for view in turn)}:
+                del views[each]
+            share = round(steps * (1.0 - views.total() / whole)) - done
+            self._refine_views(turn, share, stepped, until.share(1.0 - views.total() / left))
+            done += share
 
     def _refine_views(
-        self,
-        views: Sequence[View],
-        before: int,
-        steps: int,
-        progress: Callable[[int, int], None] | None,
-        until: Deadline,
+        self, views: Sequence[View], steps: int, stepped: Callable[[], None], until: Deadline
     ) -> None:
-        """``steps`` on ``views``, after as many ``before`` elsewhere."""
-        whole = self.config.optimiser.refine_steps
         order = shuffled_views(views, steps, self._random) if len(self.gaussians) else []
         with self.scene.learning_from(order), self.optimiser.stepping():
             for step, view in enumerate(order):
@@ -467,8 +474,7 @@ class Mapper:
                     self.judge_light(views)
                 if not self.refine_step(view, share_done(step, steps, passed)):
                     break
-                if progress is not None:
-                    progress(before + step + 1, whole)
+                stepped()
 
     def judge_light(self, views: Sequence[View]) -> None:
         """Between rounds of refining ``views``: light shows once the map has lost its errors."""

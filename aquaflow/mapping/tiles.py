@@ -196,13 +196,13 @@ class Tiles:
         self, gaussians: GaussianMap, sphere: Sphere, room: int
     ) -> tuple[list[int], list[int]]:
         """Keyframes whose Gaussians have to leave and to come, so that those nearest to ``sphere``
-        are in memory, as many as there is ``room`` for."""
+        are in memory: all that reach into it, and as many more as there is ``room`` for."""
         owners, spheres, counts = _spheres(gaussians)
         inside, out = owners.tolist(), sorted(self.waiting)
         apart = _distances([*spheres, *(self.waiting[n].sphere for n in out)], sphere)
         order = np.argsort(apart, kind="stable")
         sizes = np.concatenate([counts, [self.waiting[n].count for n in out]])[order]
-        near = order[np.cumsum(sizes) <= room]
+        near = order[(np.cumsum(sizes) <= room) | (apart[order] < 0.0)]
         chosen = {[*inside, *out][i] for i in near.tolist()}
         leaving = [n for n in inside if n not in chosen and n not in self.waiting]
         return leaving, [n for n in out if n in chosen]
@@ -253,16 +253,22 @@ class Tiles:
             self.waiting[keyframe] = replace(tile, sphere=tile.sphere.moved(move), move=whole)
 
     def open_keyframes(self) -> set[int]:
-        """Keyframes in whose ground no tile waits, as far as the nearest one tells."""
+        """Keyframes in whose ground no tile waits."""
         if not self.waiting:
             return set(self.seen)
-        tiles = [tile.sphere for tile in self.waiting.values()]
-        apart, which = KDTree(np.stack([tile.centre for tile in tiles])).query(
-            np.stack([sphere.centre for sphere in self.seen.values()])
-        )
-        radii = np.array([tile.radius for tile in tiles])[which]
-        radii += [sphere.radius for sphere in self.seen.values()]
-        return {number for number, ok in zip(self.seen, apart > radii, strict=True) if ok}
+        centres = np.stack([tile.sphere.centre for tile in self.waiting.values()])
+        radii = np.array([tile.sphere.radius for tile in self.waiting.values()])
+        seen = np.stack([sphere.centre for sphere in self.seen.values()])
+        # Most are told by the nearest tile alone.
+        apart, nearest = KDTree(centres).query(seen)
+        perhaps = np.asarray(apart - radii[nearest])
+        found = set[int]()
+        for (number, sphere), gap in zip(self.seen.items(), perhaps.tolist(), strict=True):
+            if gap >= sphere.radius:
+                gaps = np.linalg.norm(centres - sphere.centre, axis=1) - radii - sphere.radius
+                if gaps.min() >= 0.0:
+                    found.add(number)
+        return found
 
     def absorb(self, other: Tiles) -> None:
         """Take over those of another map, already moved into this one's world."""

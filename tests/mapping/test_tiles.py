@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from aquaflow.base.clocks.wall import Deadline
 from aquaflow.config import Config, MappingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import Pointmap
@@ -124,6 +127,55 @@ def test_steps_are_taken_on_ground_of_which_nothing_waits(tmp_path: Path) -> Non
     assert mapper._here
     for view in mapper._here:
         assert mapper.tiles.near(mapper.tiles.seen[view.keyframe]) == []
+
+
+def learned_while_refining(mapper: Mapper, monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
+    """Steps of refining on each keyframe's views; no waiting tile lies in what they see."""
+    steps = Counter[int]()
+    step = mapper.optimiser.step
+
+    def counted(view: View, refine_pose: bool) -> None:
+        assert mapper.tiles.near(mapper.tiles.seen[view.keyframe]) == []
+        steps[view.keyframe] += 1
+        step(view, refine_pose)
+
+    monkeypatch.setattr(mapper.optimiser, "step", counted)
+    return steps
+
+
+def test_refining_comes_to_all_ground_though_memory_has_no_room_for_a_neighbourhood(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper = mapped(30, tmp_path).mappers[0]
+    mapper.config = config(ROOM // 20)
+    steps = learned_while_refining(mapper, monkeypatch)
+    mapper.refine()
+    assert set(steps) == set(range(30))
+
+
+def test_a_map_of_several_memories_has_the_steps_of_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper = mapped(30, tmp_path).mappers[0]
+    steps, told = learned_while_refining(mapper, monkeypatch), list[tuple[int, int]]()
+    expected = mapper.config.optimiser.refine_steps * mapper.count / ROOM
+    assert expected > 1.3 * mapper.config.optimiser.refine_steps
+    mapper.refine(lambda done, whole: told.append((done, whole)))
+    assert steps.total() == round(expected)
+    assert told == [(done + 1, round(expected)) for done in range(round(expected))]
+
+
+def test_grounds_share_the_time_of_refining(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapper, ticks = mapped(30, tmp_path).mappers[0], itertools.count()
+    mapper.config = mapper.config.model_copy(
+        update={"optimiser": mapper.config.optimiser.model_copy(update={"refine_steps": 10_000})}
+    )
+    steps = learned_while_refining(mapper, monkeypatch)
+    mapper.refine(until=Deadline(300.0, lambda: float(next(ticks))))
+    assert set(steps) == set(range(30))
+    assert max(steps.values()) < 0.2 * steps.total()
 
 
 def test_a_tile_that_waited_is_where_its_keyframe_was_moved_to(tmp_path: Path) -> None:
