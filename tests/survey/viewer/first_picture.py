@@ -2,16 +2,23 @@
 
     python -m tests.survey.viewer.first_picture DIVE [--gaussians 500000] [--mbit 10]
 
-DIVE is any finished dive; its map is replaced, in a copy, by a textured relief of 20 x 20 m with so
-many Gaussians. The browser is a headless Chromium with an empty cache that draws on the processor.
+DIVE is any finished dive, which is shown by ``aquaflow view`` in a process of its own, at first
+without a packed map (view.zip is removed), then with it. With ``--gaussians`` its map is replaced,
+in a copy, by a textured relief of 20 x 20 m. The browser is a headless Chromium with an empty cache
+that draws on the processor.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import re
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -19,10 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.config.service import ViewerConfig
-from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, write_ply
-from aquaflow.survey.viewer.finished import finished_dive, prepare, show_dive
+from aquaflow.survey.viewer.packing import NAME
 from tests.browser import Browser
 
 ROUND_TRIP_S = 0.02
@@ -95,14 +100,49 @@ def relief(count: int) -> tuple[PlyGaussians, PlyGaussians]:
     return PlyGaussians(colours=water, **plain), PlyGaussians(colours=clear, **plain)
 
 
+class Server:
+    """``aquaflow view`` of a dive."""
+
+    def __init__(self, dive: Path) -> None:
+        """Wait until it listens."""
+        began = time.monotonic()
+        command = [sys.executable, "-m", "aquaflow", "view", str(dive), "--port", "0"]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        said = re.search(r"http://[^/]+:(\d+)/", self._process.stdout.readline())
+        assert said is not None, "the viewer did not start"
+        self.port, self.ready_s = int(said[1]), time.monotonic() - began
+
+    @property
+    def cpu_s(self) -> float:
+        """That it used so far."""
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    @property
+    def peak_mb(self) -> float:
+        """Most that was resident, pages of mapped files included."""
+        said = Path(f"/proc/{self._process.pid}/status").read_text()
+        return int(said.partition("VmHWM:")[2].split()[0]) / 1024.0
+
+    def close(self) -> None:
+        """End it as Ctrl-C does."""
+        self._process.send_signal(signal.SIGINT)
+        self._process.wait(60.0)
+
+
+SETTLE_S = 3.0
+"""Until tiles near the eye came, for a picture of the whole."""
+ARRIVED = """return performance.getEntriesByType("resource")
+    .find(each => /map\\/.*\\/0$/.test(each.name)).responseEnd"""
+"""When the first chunk was there, packed, ms."""
+
+
 def measure(dive: Path, mbit: float, picture: Path | None) -> dict[str, float]:
-    """Seconds since the address was opened, and megabytes sent by then."""
-    began = time.monotonic()
-    read = finished_dive(Dive(dive), 10**9)
-    page = show_dive(read, ViewerConfig(port=0))
-    behind = prepare(dive, read.key, read.packed, read.map, page)
-    ready_s = time.monotonic() - began
-    link = SlowLink(int(page.address.rstrip("/").rpartition(":")[2]), mbit * 1e6 / 8)
+    """Seconds since the address was opened, megabytes sent by then, and what the server took."""
+    server = Server(dive)
+    found = {"server_ready_s": server.ready_s, "server_ready_cpu_s": server.cpu_s}
+    link = SlowLink(server.port, mbit * 1e6 / 8)
     with tempfile.TemporaryDirectory() as profile:
         browser = Browser(Path(profile) / "profile", webgl=True)
         try:
@@ -110,36 +150,50 @@ def measure(dive: Path, mbit: float, picture: Path | None) -> dict[str, float]:
             opened = time.monotonic()
             browser.open(f"http://127.0.0.1:{link.port}/")
             browser.wait("window.aquaflowTimes?.first")
+            found |= {"server_first_cpu_s": server.cpu_s, "server_first_mb": server.peak_mb}
+            arrived_s = browser.run(ARRIVED) / 1000.0
             if picture is not None:
                 browser.screenshot(picture)
             browser.wait("window.aquaflowTimes.whole")
             times = browser.run("return window.aquaflowTimes")
-            cost_us = browser.run("return window.aquaflowTimes.cost_us")
+            if picture is not None:
+                time.sleep(SETTLE_S)
+                browser.screenshot(picture.with_stem(f"{picture.stem}_whole"))
+            found |= {"server_whole_cpu_s": server.cpu_s, "server_whole_mb": server.peak_mb}
         finally:
             browser.close()
-            page.close()
-            behind.join()
+            server.close()
     seconds = {name: times[name] / 1000.0 for name in ("script", "data", "first", "whole")}
-    megabytes = {f"{name}_mb": link.until(opened + t_s) / 1e6 for name, t_s in seconds.items()}
-    return {"server_ready": ready_s, **seconds, **megabytes, "gaussian_us": cost_us}
+    seconds["arrived"] = arrived_s
+    sent = {f"{name}_mb": link.until(opened + t_s) / 1e6 for name, t_s in seconds.items()}
+    return {**found, **seconds, **sent, "gaussian_us": times["cost_us"]}
+
+
+def looks(dive: Path, mbit: float, picture: Path | None) -> None:
+    """Print what the first look takes, and the second one, which has the packed map."""
+    (dive / NAME).unlink(missing_ok=True)
+    for look in ("first", "second"):
+        found = measure(dive, mbit, picture and picture.with_stem(f"{picture.stem}_{look}"))
+        rounded = {name: round(value, 3) for name, value in found.items()}
+        print(json.dumps({"look": look} | rounded), flush=True)
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0])
     parser.add_argument("dive", type=Path)
-    parser.add_argument("--gaussians", type=int, default=500_000)
+    parser.add_argument("--gaussians", type=int, help="a map made for this, in place of the dive's")
     parser.add_argument("--mbit", type=float, default=10.0)
-    parser.add_argument("--picture", type=Path, help="keep what is on the screen first")
+    parser.add_argument("--picture", type=Path, help="keep what is on the screen, by these names")
     given = parser.parse_args()
+    if given.gaussians is None:
+        looks(given.dive, given.mbit, given.picture)
+        return
     with tempfile.TemporaryDirectory() as folder:
         dive = shutil.copytree(given.dive, Path(folder) / "dive")
         for name, splats in zip(("map", "map_clear"), relief(given.gaussians), strict=True):
             write_ply(dive / f"{name}.ply", splats)
-        for look in ("first", "second"):  # the second one has the packed map of the first
-            found = measure(dive, given.mbit, given.picture)
-            rounded = {name: round(value, 3) for name, value in found.items()}
-            print(json.dumps({"look": look} | rounded), flush=True)
+        looks(dive, given.mbit, given.picture)
 
 
 if __name__ == "__main__":
