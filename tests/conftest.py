@@ -18,6 +18,7 @@ What a new test has to respect, so that `make test` stays quick and passes on a 
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import sys
 import threading
@@ -107,6 +108,8 @@ def command(
     from aquaflow.cli import console
 
     monkeypatch.setattr(console, "LINE_S", LINE_S)
+    logger = logging.getLogger("aquaflow")  # a command's handler writes to what this test captures
+    monkeypatch.setattr(logger, "handlers", [*logger.handlers])
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
     def run(*arguments: object) -> Ran:
