@@ -5,6 +5,7 @@ import { WebGl } from "./webgl.js";
 
 const MOVING_MS = 60, STILL_MS = 2500; // of one picture, while the eye moves and when it rests
 const FEWEST = 12000; // that are drawn on however slow a device
+const FIRST = 4000; // that are drawn before it is known how slow the device is: a second on a busy processor
 const SHARPEST = 1.5; // device pixels for each of CSS: more cost a tablet its smoothness
 const DARK = [0.067, 0.094, 0.114];
 const NONE = [0, 0, 0], ONE = [1, 1, 1];
@@ -84,7 +85,7 @@ export class Drawing {
 
   // How many are drawn now: as many as the device draws in time; what that is, the first chunk tells.
   get limit() {
-    if (this.shownAt === undefined) return Math.min(this.count, this.about.ends[0]);
+    if (this.shownAt === undefined) return Math.min(this.count, this.first + FIRST);
     return Math.min(Math.max(this.count, this.detail), this.inTime(this.moving ? MOVING_MS : STILL_MS));
   }
 
@@ -156,7 +157,7 @@ export class Drawing {
   // Whether the last picture is on the screen; learns what a Gaussian costs.
   finished() {
     if (this.renderer.busy) return false;
-    const cost = 1000 * (performance.now() - this.began) / Math.max(this.painted, FEWEST) / (this.look.wipe === null ? 1 : 2);
+    const cost = 1000 * (performance.now() - this.began) / Math.max(this.painted, FIRST) / (this.look.wipe === null ? 1 : 2);
     this.began = null;
     this.cost_us += (this.shownAt === undefined ? 1 : 0.5) * (cost - this.cost_us);
     if (this.shownAt === undefined) {
