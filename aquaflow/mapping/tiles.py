@@ -264,10 +264,8 @@ class Tiles:
         perhaps = np.asarray(apart - radii[nearest])
         found = set[int]()
         for (number, sphere), gap in zip(self.seen.items(), perhaps.tolist(), strict=True):
-            if gap >= sphere.radius:
-                gaps = np.linalg.norm(centres - sphere.centre, axis=1) - radii - sphere.radius
-                if gaps.min() >= 0.0:
-                    found.add(number)
+            if gap >= sphere.radius and _gaps(centres, radii, sphere).min() >= 0.0:
+                found.add(number)
         return found
 
     def absorb(self, other: Tiles) -> None:
@@ -335,4 +333,13 @@ def _distances(spheres: Sequence[Sphere], of: Sphere) -> Array:
     """[N] between the surfaces of ``spheres`` and that ``of`` one; negative where they overlap."""
     centres = np.array([sphere.centre for sphere in spheres]).reshape(-1, 3)
     radii = np.array([sphere.radius for sphere in spheres])
+    return _gaps(centres, radii, of)
+
+
+def _gaps(
+    centres: Array,  # [N, 3]
+    radii: Array,  # [N]
+    of: Sphere,
+) -> Array:
+    """[N] as :func:`_distances`."""
     return np.asarray(np.linalg.norm(centres - of.centre, axis=1) - radii - of.radius)

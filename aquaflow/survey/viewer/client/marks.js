@@ -4,7 +4,7 @@ import { add, axesOf } from "./camera.js";
 
 export const ROW = 13; // numbers of a pose: place, rotation, quality, and five of its moment
 const LONGEST = 2000; // poses of the path that are drawn
-const COVERED = 0.15, CELL = 16; // share of the cells that the path crosses, px wide, that its line may take
+const COVERED = 0.15, CELL = 16; // share that the path may cover of the cells it crosses, px
 const NOTE = "#7fd4ff", MARK = "#ffb454", CAMERA = "#eb7828";
 const PATH = ["#8a3ba8", "#2f9fc0", "#f4e04a"]; // pose hardly known, known, well known
 
@@ -59,8 +59,9 @@ export class Marks {
     this.pen.strokeRect(optics.cx - cx * scale, optics.cy - cy * scale, width * scale, height * scale);
   }
 
-  line(a, b, colour, width = 2) {
-    const [p, q] = [this.at(a), this.at(b)];
+  line(a, b, colour, width = 2) { this.stroke(this.at(a), this.at(b), colour, width); }
+
+  stroke(p, q, colour, width) {
     if (p[2] < this.nearest || q[2] < this.nearest) return;
     this.pen.strokeStyle = colour;
     this.pen.lineWidth = width;
@@ -72,20 +73,15 @@ export class Marks {
 
   // Thinner where lines lie close together: the map is to be seen between them.
   drawPath() {
-    const shown = this.path.map(pose => this.at(pose.place)), cells = new Set();
+    const { path } = this, at = path.map(pose => this.at(pose.place)), cells = new Set();
+    const lines = [...path.keys()].filter(i => i && path[i].part === path[i - 1].part && at[i][2] >= this.nearest);
     let length = 0;
-    for (let i = 1; i < shown.length; i++) {
-      const [x, y, z] = shown[i], on = z > this.nearest && x > 0 && y > 0 && x < this.canvas.clientWidth && y < this.canvas.clientHeight;
-      if (!on || this.path[i].part !== this.path[i - 1].part) continue;
-      length += Math.min(CELL, Math.hypot(x - shown[i - 1][0], y - shown[i - 1][1]));
-      cells.add(`${Math.floor(x / CELL)} ${Math.floor(y / CELL)}`);
+    for (const i of lines) {
+      length += Math.min(CELL, Math.hypot(at[i][0] - at[i - 1][0], at[i][1] - at[i - 1][1]));
+      cells.add(Math.floor(at[i][0] / CELL) + 1e6 * Math.floor(at[i][1] / CELL));
     }
-    const width = Math.min(2, COVERED * cells.size * CELL ** 2 / Math.max(length, 1));
-    for (let i = 1; i < this.path.length; i++) {
-      if (this.path[i].part !== this.path[i - 1].part) continue;
-      const grade = Math.min(2, Math.floor(3 * this.path[i].quality));
-      this.line(this.path[i - 1].place, this.path[i].place, PATH[Math.max(0, grade)], width);
-    }
+    const width = Math.min(2, COVERED * CELL ** 2 * cells.size / length);
+    for (const i of lines) this.stroke(at[i - 1], at[i], PATH[Math.max(0, Math.min(2, Math.floor(3 * path[i].quality)))], width);
   }
 
   drawCamera() {
