@@ -163,38 +163,6 @@ def point(browser: Browser, x: float, y: float, count: int) -> None:
     browser.wait(f"Number(document.querySelector('#tools').dataset.points) === {count}")
 
 
-COVERED = """
-return import('/client/marks.js').then(({ Marks, ROW }) => {
-  const [lines, per] = [arguments[0], 40], canvas = document.createElement('canvas');
-  canvas.style = 'position: fixed; width: 400px; height: 400px';
-  document.body.append(canvas);
-  const marks = new Marks(canvas), rows = new Float32Array(ROW * lines * per);
-  for (let i = 0; i < lines * per; i++) {
-    const line = Math.floor(i / per), along = (i % per) / (per - 1);
-    const x = line % 2 ? 1 - along : along, y = line / (lines - 1);
-    rows.set([100 + 200 * x, 100 + 200 * y, 1], ROW * i);
-    rows[ROW * i + 7] = 1;
-  }
-  marks.setPath(rows, [{ first: 0 }]);
-  marks.draw({ lens: null, optics: () => null, project: point => point });
-  const pen = canvas.getContext('2d'), square = [100, 100, 200, 200].map(v => v * devicePixelRatio);
-  const inside = pen.getImageData(...square).data.filter((value, k) => k % 4 === 3);
-  canvas.remove();
-  return inside.reduce((sum, value) => sum + value, 0) / 255 / inside.length;
-});"""
-"""Share of a square of 200 px that a path of so many lines across it covers."""
-
-
-def test_lines_of_a_path_that_lie_close_together_leave_the_map_to_be_seen(
-    browser: Browser, page: ViewerPage
-) -> None:
-    browser.open(page.address)
-    browser.wait("window.aquaflowTimes")
-    two, dense = (browser.run(COVERED, lines) for lines in (2, 50))
-    assert two == pytest.approx(2 * 1.0 / 200, rel=0.5)  # half of each line's 2 px lies inside
-    assert 0.05 < dense < 0.25
-
-
 def test_the_map_is_drawn_by_webgpu_where_the_browser_has_it(shown: Browser, webgpu: bool) -> None:
     assert drawn_by_webgpu(shown) == webgpu
 

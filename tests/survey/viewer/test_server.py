@@ -116,7 +116,7 @@ def test_the_pages_files_are_small_and_sent_again_only_when_they_changed(page: V
         assert (status, headers["Content-Encoding"]) == (200, "gzip")
         assert get(page, name, **{"If-None-Match": headers["ETag"]})[:2] == (304, b"")
         total += len(data)
-    assert total < 29_000  # webgpu.js, and what few ask for, come when they are wanted
+    assert total < 28_500  # webgpu.js, and what few ask for, come when they are wanted
 
 
 def test_the_page_gets_the_kernels_that_maps_are_optimised_with(page: ViewerPage) -> None:
