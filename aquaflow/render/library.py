@@ -38,6 +38,8 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_check_flow": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT] * 3 + [_POINTER] * 2),
     "aq_fuse_depths": (_INT, [_POINTER]),
     "aq_fuse_ranges": (_INT, [_POINTER]),
+    "aq_add_colours": (_INT, [_POINTER] * 2),
+    "aq_add_information": (_INT, [_POINTER] * 2),
     "aq_pose_equations": (_INT, [_POINTER] * 3),
     "aq_anchor_errors": (_INT, [_POINTER] * 2),
     "aq_anchor_equations": (_INT, [_POINTER] * 2),

@@ -28,6 +28,7 @@
 #include "project.h"
 #include "project_backward.h"
 #include "refine_flow.h"
+#include "see_places.h"
 #include "tiles.h"
 #include "view_loss.h"
 
@@ -275,6 +276,17 @@ AQ_EXPORT int aq_fuse_depths(const FuseDepths* in) { return fuse_depths(*in); }
 // See fuse_ranges.h: distances of places from the surface that one view shows.
 AQ_EXPORT int aq_fuse_ranges(const FuseRanges* in) {
   fuse_ranges(*in);
+  return 0;
+}
+
+// See see_places.h: colours of places, and how well they are known, from what one view shows.
+AQ_EXPORT int aq_add_colours(const SeePlaces* in, const PlaceColours* out) {
+  add_colours(*in, *out);
+  return 0;
+}
+
+AQ_EXPORT int aq_add_information(const SeePlaces* in, const PlaceInformation* out) {
+  add_information(*in, *out);
   return 0;
 }
 

@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.render.library import library_or_none
 from aquaflow.render.transfers import checkpoint_in
-from aquaflow.survey.export.mesh.atlas import batches, look_at
 from aquaflow.survey.export.mesh.export_mesh import VOXEL_PX, fused_surface
+from aquaflow.survey.export.mesh.seen_places import batches, look_at
 from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, ViewSurfaces, surfaces_of_map
 from aquaflow.survey.export.ortho.drawing import Colours
 from aquaflow.survey.measure.drawn_heights import MATCH_PX
@@ -93,7 +94,7 @@ def surface_of(
     grey = np.ones(3) if balance is None else np.asarray(balance.white)
     shown, sure = [], []
     for part in batches(len(mesh.vertices)):
-        seen = look_at(views, mesh.vertices[part], side)
+        seen = look_at(views, mesh.vertices[part], side, library_or_none())
         radiance = checkpoint_in(seen.radiance[None].astype(np.float32), colours.device)
         rgb, confidence = colours.of(radiance, seen.nearest[None])
         shown.append(rgb[0] / (255.0 * grey))

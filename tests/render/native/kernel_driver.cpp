@@ -239,28 +239,30 @@ static void match(const Scene& s, bool short_of_memory) {
   std::vector<double> total(pixels), weights(pixels), around(rho);
   std::vector<int32_t> near(pixels);
   for (size_t i = 2; i < pixels; i += 3) around[i] = 0.01 * (double)(i % 700) - 1.0;
-  FuseRanges ranges{around.data(),
-                    flow.data(),
-                    confidence.data(),
-                    confidence.data(),
-                    total.data(),
-                    weights.data(),
-                    near.data(),
-                    place_count,
-                    s.width,
-                    s.height,
-                    50.0,
-                    50.0,
-                    26.0,
-                    20.0,
-                    {1, 0, 0, 0, 1, 0, 0, 0, 1},
-                    {0.1, 0.0, 0.02},
-                    0.03,
-                    10.0,
-                    3.0,
-                    0.09,
-                    0.18};
+  const ViewSurface surface{flow.data(),
+                            confidence.data(),
+                            confidence.data(),
+                            s.width,
+                            s.height,
+                            50.0,
+                            50.0,
+                            26.0,
+                            20.0,
+                            {1, 0, 0, 0, 1, 0, 0, 0, 1},
+                            {0.1, 0.0, 0.02},
+                            3.0,
+                            0.09,
+                            0.18};
+  const FuseRanges ranges{surface,     around.data(), total.data(), weights.data(),
+                          near.data(), place_count,   0.03,         10.0};
   aq_fuse_ranges(&ranges);
+  const SeePlaces places{surface, around.data(), place_count};
+  const std::vector<uint16_t> halves(3 * pixels, 0x3555);
+  std::vector<double> sums(9 * pixels), least(pixels, 1e9);
+  const PlaceColours colours{halves.data(), sums.data(), weights.data(), least.data()};
+  if (aq_add_colours(&places, &colours) != 0) std::exit(4);
+  const PlaceInformation information{1.0, sums.data(), least.data()};
+  if (aq_add_information(&places, &information) != 0) std::exit(4);
 
   // Wild depths and matches; more of them than a block holds.
   const int count = (int)pixels;

@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.render.library import library_or_none
-from aquaflow.survey.export.mesh import atlas as colouring
 from aquaflow.survey.export.mesh import blocks as blocks_module
-from aquaflow.survey.export.mesh.atlas import lay_out, look_at, paint, place_sigmas
-from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, STRIDE_PX, Blocks, truncation
+from aquaflow.survey.export.mesh import seen_places
+from aquaflow.survey.export.mesh.atlas import lay_out, paint
+from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, STRIDE_PX, Blocks
+from aquaflow.survey.export.mesh.seen_places import ColourSums, RaySums, look_at, place_sigmas
 from aquaflow.survey.export.mesh.surface import DistanceSums, add_by_numpy, add_compiled
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
+from aquaflow.survey.export.mesh.view_surfaces import surface_normals, truncation, unit_rays
 from tests.survey.export.mesh_scenes import (
     FAR_CAMERA,
     RADIUS,
@@ -132,17 +135,17 @@ def test_the_sigma_of_a_place_is_what_rays_of_one_pixel_leave_open(tmp_path: Pat
     poses = above_plane()
     surfaces = surfaces_of(poses, [to_plane] * 5, tmp_path)
     places = np.array([[0.0, 0.1, 0.0], [9.0, 9.0, 0.0]])
-    sigma, sigma_px = place_sigmas(surfaces, places, VOXEL)
+    sigma, sigma_px = place_sigmas(surfaces, places, VOXEL, None)
     # Five rays within 0.3 of each other from 2 above: a pixel is 0.02, the height worse.
     assert 0.02 < sigma[0] < 0.12
     assert sigma_px[0] == pytest.approx(sigma[0] / 0.02, rel=0.1)
     assert np.isinf([sigma[1], sigma_px[1]]).all()
-    seen = look_at(surfaces, places, VOXEL)
+    seen = look_at(surfaces, places, VOXEL, None)
     assert np.isinf(seen.nearest[1])
     np.testing.assert_allclose(seen.radiance[0], [0.5, 0.6, 0.5], atol=0.02)
     alone = surfaces_of(poses[:1], [to_plane], tmp_path)
-    assert place_sigmas(alone, np.zeros((1, 3)), VOXEL)[0] > 1e3
-    assert np.isfinite(look_at(alone, np.zeros((1, 3)), VOXEL).nearest[0])
+    assert place_sigmas(alone, np.zeros((1, 3)), VOXEL, None)[0] > 1e3
+    assert np.isfinite(look_at(alone, np.zeros((1, 3)), VOXEL, None).nearest[0])
 
 
 def test_compiled_fusion_finds_what_numpy_finds(tmp_path: Path) -> None:
@@ -163,6 +166,50 @@ def test_compiled_fusion_finds_what_numpy_finds(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.near, expected.near)
     np.testing.assert_allclose(found.weights, expected.weights, rtol=1e-12)
     np.testing.assert_allclose(found.total, expected.total, rtol=1e-9, atol=1e-6)
+
+
+def test_compiled_colours_and_information_are_those_of_numpy(tmp_path: Path) -> None:
+    library = library_or_none()
+    if library is None:
+        pytest.skip("no compiled kernels here")
+    surfaces = surfaces_of(above_plane(), [plane_with_hole, *[to_plane] * 4], tmp_path)
+    places = np.random.default_rng(0).uniform((-2.0, -2.0, -0.3), (2.0, 2.0, 0.3), (20000, 3))
+    places[:2] = np.array([[np.nan], [np.inf]])
+    places[2:7] = [view.T_uc.t for view in surfaces.views]
+    for kind in (ColourSums, RaySums):
+        expected, found = kind.of(places), kind.of(places)
+        for number in range(5):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                expected.add_by_numpy(surfaces, number, VOXEL)
+            found.add_compiled(library, surfaces, number, VOXEL)
+        for name, values in vars(expected).items():
+            np.testing.assert_allclose(getattr(found, name), values, rtol=1e-9, atol=1e-9)
+        seen = np.isfinite(vars(expected)["nearest" if kind is ColourSums else "footprint"])
+        assert 1000 < seen.sum() < 19000
+
+
+def test_halves_of_any_size_are_read(tmp_path: Path) -> None:
+    library = library_or_none()
+    if library is None:
+        pytest.skip("no compiled kernels here")
+    surfaces = surfaces_of(above_plane()[:1], [to_plane], tmp_path)
+    every = np.array([0.0, 2.0**-24, -(2.0**-15), 6.1e-5, 0.1, -1.0, 65504.0], np.float16)
+    radiance = surfaces.radiance(0)
+    radiance[:] = every[np.arange(radiance.size) % len(every)].reshape(radiance.shape)
+    places = np.random.default_rng(1).uniform((-0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (500, 3))
+    expected, found = (look_at(surfaces, places, VOXEL, each) for each in (None, library))
+    np.testing.assert_allclose(found.radiance, expected.radiance, rtol=1e-9)
+    assert set(every.astype(float)) <= set(np.round(expected.radiance.ravel(), 30))
+
+
+@pytest.mark.parametrize("stride", [2, 4, 5])
+def test_normals_of_some_pixels_are_those_of_all(stride: int) -> None:
+    ranges = np.random.default_rng(2).uniform(1.0, 1.1, (38, 51))
+    ranges[9:12, 20] = np.nan
+    camera = CameraModel(51, 38, 40.0, 40.0, 25.0, 19.0)
+    every = surface_normals(unit_rays(camera), ranges)
+    some = surface_normals(unit_rays(camera), ranges, stride)
+    np.testing.assert_array_equal(some, every[::stride, ::stride])
 
 
 def test_a_chunk_has_its_blocks_and_those_in_the_layer_after_it(tmp_path: Path) -> None:
@@ -218,7 +265,7 @@ def test_a_texture_has_the_colours_of_its_places_up_to_its_seams(
     sphere: TriangleMesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("xatlas", reason="xatlas is not installed")
-    monkeypatch.setattr(colouring, "BATCH", 1000)
+    monkeypatch.setattr(seen_places, "BATCH", 1000)
 
     def colour(places: Array):  # type: ignore[no-untyped-def]  # as in atlas.Colour
         return np.clip(127.0 * (places + 1.0), 0, 255).astype(np.uint8), places[:, 2] < 0.99
@@ -239,6 +286,6 @@ def test_a_texture_that_would_be_too_large_is_coarser(
     sphere: TriangleMesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("xatlas", reason="xatlas is not installed")
-    monkeypatch.setattr("aquaflow.survey.export.mesh.atlas.LARGEST_SIDE", 128)
-    layout = lay_out(sphere, 0.001)
-    assert max(layout.width, layout.height) <= 256
+    monkeypatch.setattr("aquaflow.survey.export.mesh.atlas.LARGEST_SIDE", 1024)
+    layout = lay_out(sphere, 0.0001)
+    assert 512 < max(layout.width, layout.height) <= 1024

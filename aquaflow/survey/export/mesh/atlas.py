@@ -11,12 +11,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from aquaflow.base.errors import load
-from aquaflow.render.transfers import checkpoint_in
-from aquaflow.survey.export.mesh.blocks import truncation
+from aquaflow.survey.export.mesh.seen_places import batches
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
-from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, SIGMA, ViewSurfaces
-from aquaflow.survey.export.ortho.drawing import Colours
-from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -27,9 +23,11 @@ LARGEST_SIDE = 8192
 """Pixels of a texture: what any desktop's GPU takes (D3D 10 asks for it, OpenGL 4.1 for twice)."""
 FILLED = 0.5
 """Share of a texture that triangles are expected to take; xatlas reaches 0.8 on the reef."""
-GROUP = 500
-"""Triangles that are laid out together, neighbours in space: for 80 000 of the reef xatlas takes
-3.7 CPU s so, 8.2 in groups of 2000, and finds as many charts, on 4 % more pixels."""
+COARSER = 1.1
+"""What texels are larger by than a texture that is too large is too wide."""
+GROUP = 250
+"""Triangles that are laid out together, neighbours in space: for 206 000 of the reef xatlas takes
+6.2 CPU s so, 9.6 in groups of 500, 15.5 of 1000; on 15 % more pixels than in groups of 500."""
 FACES = 1 << 14
 """Triangles whose pixels are found at a time."""
 PADDING_PX = 2
@@ -62,9 +60,18 @@ def lay_out(mesh: TriangleMesh, texel: float) -> AtlasLayout:
     Raises:
         InputError: xatlas is not installed.
     """
+    texel = max(texel, math.sqrt(mesh.area() / FILLED) / LARGEST_SIDE)
+    layout = _lay_out_at(mesh, texel)
+    while (side := max(layout.width, layout.height)) > LARGEST_SIDE:
+        # Padding takes its share, however coarse the texels are.
+        texel *= COARSER * side / LARGEST_SIDE
+        layout = _lay_out_at(mesh, texel)
+    return layout
+
+
+def _lay_out_at(mesh: TriangleMesh, texel: float) -> AtlasLayout:
+    """``mesh`` with ``texel`` as the side of a pixel, however large the picture becomes."""
     xatlas = load("xatlas", "a textured mesh", "survey")
-    most = FILLED * LARGEST_SIDE**2
-    texel = max(texel, math.sqrt(mesh.area() / most))
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     packing.texels_per_unit, packing.padding = 1.0 / texel, PADDING_PX
     normals, used = mesh.normals().astype(np.float32), list[Integers]()
@@ -182,115 +189,3 @@ def _grow(
             new = before[tuple(there)] & ~painted[tuple(here)]
             picture[tuple(here)][new] = picture[tuple(there)][new]
             painted[tuple(here)] |= new
-
-
-# --------------------------------------------------------------------------------------------------
-# What the views say of places on the surface: colour, and how well the place is known.
-#
-# Colours are those of the ortho: the map's radiance, as restored from the range of the nearest view
-# (export/ortho/drawing.py), whose bound on the amplification holds for a mesh as well.
-
-BATCH = 1 << 16
-"""Places worked on at a time; 20 MB."""
-SAME_SURFACE = 2.0
-"""Truncations between a place and the surface that a view shows, up to which it is that surface."""
-
-
-@dataclass(frozen=True)
-class ObservedColours:
-    """Some places as the views see them."""
-
-    radiance: Array
-    """[M, 3] J, the mean of the views, those that are near and see it from the front first."""
-    nearest: Array
-    """[M] range of the nearest view in the mesh's unit; infinite where none sees the place."""
-
-
-def look_at(
-    surfaces: ViewSurfaces,
-    places: Array,  # [M, 3]
-    voxel: float,
-) -> ObservedColours:
-    """How the views see ``places`` of the surface."""
-    total, weights = np.zeros((len(places), 3)), np.zeros(len(places))
-    nearest = np.full(len(places), np.inf)
-    for seen in _sightings(surfaces, places, voxel):
-        weight, (row, column) = (seen.cosines / seen.ranges) ** 2, seen.pixels
-        total[seen.which] += weight[:, None] * surfaces.radiance(seen.number)[:, row, column].T
-        weights[seen.which] += weight
-        nearest[seen.which] = np.minimum(nearest[seen.which], seen.ranges)
-    return ObservedColours(total / np.maximum(weights, 1e-30)[:, None], nearest)
-
-
-def place_sigmas(
-    surfaces: ViewSurfaces,
-    places: Array,  # [M, 3]
-    voxel: float,
-) -> tuple[Array, Array]:
-    """How well ``places`` of the surface are known, in the direction that is known least, where
-    rays meet that are each known to PICTURE_SIGMA_PX: [M] 1 sigma in the mesh's unit, and the same
-    in widths of a pixel there, of the nearest view; infinite of what fewer than two views see."""
-    footprint = np.full(len(places), np.inf)
-    information = np.zeros((len(places), 3, 3))
-    for seen in _sightings(surfaces, places, voxel):
-        view = surfaces.views[seen.number]
-        rays = (places[seen.which] - view.T_uc.t) / seen.ranges[:, None]
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        width = seen.ranges / view.camera.fx
-        footprint[seen.which] = np.minimum(footprint[seen.which], width)
-        information[seen.which] += across / ((PICTURE_SIGMA_PX * width) ** 2)[:, None, None]
-    least = np.linalg.eigvalsh(information)[:, 0]
-    known = least > 0.0
-    sigma = np.where(known, 1.0 / np.sqrt(np.where(known, least, 1.0)), np.inf)
-    return sigma, np.where(known, sigma / np.where(known, footprint, 1.0), np.inf)
-
-
-@dataclass(frozen=True)
-class _Sighting:
-    """The places that a view shows, K of them."""
-
-    number: int
-    """Of the view."""
-    which: Integers
-    """[K] numbers of the places."""
-    pixels: tuple[Integers, Integers]
-    """[K] rows and columns."""
-    ranges: Array
-    """[K] of the places from the view."""
-    cosines: Array
-    """[K] of the incidence."""
-
-
-def _sightings(
-    surfaces: ViewSurfaces,
-    places: Array,  # [M, 3]
-    voxel: float,
-) -> Iterator[_Sighting]:
-    """Of each view that may show some of the places."""
-    for number in surfaces.around(places.min(axis=0), places.max(axis=0)):
-        view, layers = surfaces.views[number], surfaces.surface(number)
-        local = (places - view.T_uc.t) @ view.T_uc.R
-        which = np.flatnonzero(view.shows(local))
-        column, row = np.floor(view.camera.project(local[which])).astype(np.intp).T
-        ranges = np.linalg.norm(local[which], axis=1)
-        cosines = layers[COSINE][row, column].astype(np.float64)
-        reach = SAME_SURFACE * truncation(layers[SIGMA][row, column], voxel)
-        with np.errstate(invalid="ignore"):
-            same = np.abs(layers[RANGE][row, column] - ranges) * cosines <= reach
-        pixels = row[same], column[same]
-        yield _Sighting(number, which[same], pixels, ranges[same], cosines[same])
-
-
-def batches(count: int) -> Iterator[slice]:
-    """Parts of ``count`` places."""
-    for first in range(0, count, BATCH):
-        yield slice(first, min(count, first + BATCH))
-
-
-def shown_colours(
-    colours: Colours, seen: ObservedColours
-) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
-    """RGB [M, 3] of places, and which of them [M] a view sees."""
-    radiance = checkpoint_in(seen.radiance[None].astype(np.float32), colours.device)
-    found, _ = colours.of(radiance, seen.nearest[None])
-    return found[0], np.isfinite(seen.nearest)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces
+from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, truncation
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -31,22 +31,8 @@ BITS = 21
 LARGEST = 1 << (BITS - 1)
 STEPS = np.array([x << 2 * BITS | y << BITS | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 """[8] from a block's number to those of the blocks behind it along any of the axes."""
-TRUNCATION_SIGMAS = 3.0
-"""Distance from its surface, in sigmas of the range, up to which a pixel counts for a place."""
-TRUNCATION_VOXELS = (3.0, 6.0)
-"""Least and most of it: the least holds all corners of a cell that the surface cuts, with a margin
-of a voxel for views that differ; the most is what a block covers."""
 STRIDE_PX = 2
 """Of the pixels that blocks are found by: what two voxels of the default side are apart."""
-
-
-def truncation(
-    sigmas: npt.NDArray[np.floating],  # [...] of ranges
-    voxel: float,
-) -> Array:
-    """[...] distance from a surface within which it counts, in the unit of both."""
-    least, most = TRUNCATION_VOXELS
-    return np.clip(TRUNCATION_SIGMAS * sigmas, least * voxel, most * voxel)
 
 
 @dataclass(frozen=True)

@@ -19,17 +19,11 @@ from aquaflow.dive.placement import Placement
 from aquaflow.dive.png import encoded_png
 from aquaflow.dive.point_cloud import read_posed_views
 from aquaflow.render.library import library_or_none
-from aquaflow.survey.export.mesh.atlas import (
-    batches,
-    lay_out,
-    look_at,
-    paint,
-    place_sigmas,
-    shown_colours,
-)
+from aquaflow.survey.export.mesh.atlas import lay_out, paint
 from aquaflow.survey.export.mesh.blocks import Blocks
 from aquaflow.survey.export.mesh.glb import write_glb
 from aquaflow.survey.export.mesh.placed_mesh import PlacedMesh, Texture
+from aquaflow.survey.export.mesh.seen_places import batches, look_at, place_sigmas, shown_colours
 from aquaflow.survey.export.mesh.surface import SurfaceBuilder, fuse, require_marching_cubes
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
@@ -83,7 +77,7 @@ class FusedSurface:
 
     mesh: TriangleMesh
     sigma: Array
-    """[N] of the vertices: :func:`aquaflow.survey.export.mesh.atlas.place_sigmas`."""
+    """[N] of the vertices: :func:`aquaflow.survey.export.mesh.seen_places.place_sigmas`."""
     views: ViewSurfaces
     voxel: float
     """Side of a voxel."""
@@ -128,7 +122,7 @@ def export_mesh(
     def colour(
         places: Array,  # [M, 3]
     ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
-        return shown_colours(colours, look_at(views, places, surface.voxel))
+        return shown_colours(colours, look_at(views, places, surface.voxel, library_or_none()))
 
     seen = "without water" if through is None else f"through {through:.3g} {where.unit} of water"
     placed = _place_mesh(surface, where, seen)
@@ -191,7 +185,7 @@ def fused_surface(views: ViewSurfaces, voxel: float, report: Progress) -> FusedS
 def _vertex_sigmas(views: ViewSurfaces, mesh: TriangleMesh, voxel: float) -> tuple[Array, Array]:
     """[N] :func:`place_sigmas` of the vertices."""
     parts = [
-        np.stack(place_sigmas(views, mesh.vertices[part], voxel))
+        np.stack(place_sigmas(views, mesh.vertices[part], voxel, library_or_none()))
         for part in batches(len(mesh.vertices))
     ]
     sigma, sigma_px = np.concatenate([np.empty((2, 0)), *parts], axis=1)

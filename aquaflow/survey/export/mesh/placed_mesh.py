@@ -38,7 +38,7 @@ class PlacedMesh:
     faces: Integers
     """[M, 3] counter-clockwise seen from outside."""
     sigma: Array
-    """[N] as in :func:`aquaflow.survey.export.mesh.atlas.place_sigmas`."""
+    """[N] as in :func:`aquaflow.survey.export.mesh.seen_places.place_sigmas`."""
     origin: tuple[float, float, float]
     """To be added to the positions; zeros without a grid."""
     where: Placement

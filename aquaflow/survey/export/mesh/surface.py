@@ -17,16 +17,16 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import load
 from aquaflow.render.library import Library
-from aquaflow.survey.export.mesh.blocks import (
-    BLOCK,
-    CHUNK_BLOCKS,
-    TRUNCATION_SIGMAS,
-    TRUNCATION_VOXELS,
-    Chunk,
+from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Chunk
+from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
+from aquaflow.survey.export.mesh.view_surfaces import (
+    COSINE,
+    RANGE,
+    SIGMA,
+    NativeSurface,
+    ViewSurfaces,
     truncation,
 )
-from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
-from aquaflow.survey.export.mesh.view_surfaces import COSINE, RANGE, SIGMA, ViewSurfaces
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -251,15 +251,10 @@ class _NativeFusion(ctypes.Structure):
     """``FuseRanges`` of native/fuse_ranges.h."""
 
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("places", "ranges", "sigmas", "cosines")),
-        *((name, ctypes.c_void_p) for name in ("total", "weights", "near")),
+        ("view", NativeSurface),
+        *((name, ctypes.c_void_p) for name in ("places", "total", "weights", "near")),
         ("count", ctypes.c_int64),
-        *((name, ctypes.c_int32) for name in ("width", "height")),
-        *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
-        ("R", ctypes.c_double * 9),
-        ("t", ctypes.c_double * 3),
         *((name, ctypes.c_double) for name in ("nearest_z", "far")),
-        *((name, ctypes.c_double) for name in ("reach_sigmas", "least_reach", "most_reach")),
     )
 
 
@@ -267,17 +262,10 @@ def add_compiled(
     library: Library, sums: DistanceSums, surfaces: ViewSurfaces, number: int, voxel: float
 ) -> None:
     """As :func:`add_by_numpy`, in an eighth of its time (native/fuse_ranges.h)."""
-    view, layers = surfaces.views[number], surfaces.surface(number)
-    camera, T_uc = view.camera, view.T_uc
-    least, most = TRUNCATION_VOXELS
     given = _NativeFusion(
-        count=len(sums.places), width=camera.width, height=camera.height,
-        fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, nearest_z=voxel, far=surfaces.far,
-        reach_sigmas=TRUNCATION_SIGMAS, least_reach=least * voxel, most_reach=most * voxel,
+        view=NativeSurface.of(surfaces, number, voxel),
+        count=len(sums.places), nearest_z=voxel, far=surfaces.far,
     )  # fmt: skip
-    of_view = {"ranges": layers[RANGE], "sigmas": layers[SIGMA], "cosines": layers[COSINE]}
-    own = {name: getattr(sums, name) for name in ("places", "total", "weights", "near")}
-    for name, array in {**own, **of_view}.items():
-        setattr(given, name, array.ctypes.data)
-    given.R[:], given.t[:] = T_uc.R.reshape(-1), T_uc.t
+    for name in ("places", "total", "weights", "near"):
+        setattr(given, name, getattr(sums, name).ctypes.data)
     library.call("aq_fuse_ranges", ctypes.byref(given))

@@ -7,7 +7,9 @@ out. With what one pixel of the picture says of a place, it makes the sigma of t
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,11 @@ LEAST_COSINE = 0.1
 by ten pixels' width within one."""
 SLOPE_PX = 3
 """Half the distance over which slopes of ranges are taken: over less, single Gaussians show."""
+TRUNCATION_SIGMAS = 3.0
+"""Distance from its surface, in sigmas of the range, up to which a pixel counts for a place."""
+TRUNCATION_VOXELS = (3.0, 6.0)
+"""Least and most of it: the least holds all corners of a cell that the surface cuts, with a margin
+of a voxel for views that differ; the most is what a block covers."""
 RANGE, SIGMA, COSINE = range(3)
 """Layers that are kept of a view, of which NaN as range means none."""
 AREA_FOOTPRINTS = 32.0
@@ -96,17 +103,13 @@ class ViewSurfaces:
     def points(self, number: int, stride: int = 1) -> tuple[Array, Array, Array]:
         """What a view shows: points [M, 3], unit normals towards it [M, 3] and sigmas [M]."""
         view, layers = self.views[number], self.surface(number)
-        ranges = layers[RANGE].astype(np.float64)
-        rays = unit_rays(view.camera)
-        local, normals = rays * ranges[..., None], surface_normals(rays, ranges)
+        ranges, rays = layers[RANGE].astype(np.float64), unit_rays(view.camera)
+        normals = surface_normals(rays, ranges, stride)
+        rays, ranges, sigmas = (each[::stride, ::stride] for each in (rays, ranges, layers[SIGMA]))
         with np.errstate(invalid="ignore"):
-            kept = ranges < self.far
-        kept &= np.isfinite(normals).all(axis=-1)
-        skipped = np.zeros_like(kept)
-        skipped[::stride, ::stride] = True
-        kept &= skipped
-        R, sigmas = view.T_uc.R, layers[SIGMA][kept].astype(np.float64)
-        return view.T_uc.apply(local[kept]), normals[kept] @ R.T, sigmas
+            kept = (ranges < self.far) & np.isfinite(normals).all(axis=-1)
+        points = view.T_uc.apply(rays[kept] * ranges[kept][:, None])
+        return points, normals[kept] @ view.T_uc.R.T, sigmas[kept].astype(np.float64)
 
     def _survey(self) -> None:
         medians, footprints = [], []
@@ -147,24 +150,77 @@ class ViewSurfaces:
         return np.flatnonzero(((first <= high) & (last >= low)).all(axis=1)).tolist()
 
 
+def truncation(
+    sigmas: npt.NDArray[np.floating],  # [...] of ranges
+    voxel: float,
+) -> Array:
+    """[...] distance from a surface within which it counts, in the unit of both."""
+    least, most = TRUNCATION_VOXELS
+    return np.clip(TRUNCATION_SIGMAS * sigmas, least * voxel, most * voxel)
+
+
+class NativeSurface(ctypes.Structure):
+    """``ViewSurface`` of native/view_surface.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("ranges", "sigmas", "cosines")),
+        *((name, ctypes.c_int32) for name in ("width", "height")),
+        *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
+        ("R", ctypes.c_double * 9),
+        ("t", ctypes.c_double * 3),
+        *((name, ctypes.c_double) for name in ("reach_sigmas", "least_reach", "most_reach")),
+    )
+
+    @staticmethod
+    def of(
+        surfaces: ViewSurfaces, number: int, voxel: float, truncations: float = 1.0
+    ) -> NativeSurface:
+        """Of a view, whose layers it points into; ``truncations`` of them are its reach."""
+        view, layers = surfaces.views[number], surfaces.surface(number)
+        camera, T_uc = view.camera, view.T_uc
+        least, most = (truncations * voxels * voxel for voxels in TRUNCATION_VOXELS)
+        native = NativeSurface(
+            width=camera.width, height=camera.height,
+            fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
+            reach_sigmas=truncations * TRUNCATION_SIGMAS, least_reach=least, most_reach=most,
+        )  # fmt: skip
+        for name, layer in (("ranges", RANGE), ("sigmas", SIGMA), ("cosines", COSINE)):
+            setattr(native, name, layers[layer].ctypes.data)
+        native.R[:], native.t[:] = T_uc.R.reshape(-1), T_uc.t
+        return native
+
+
+@lru_cache(maxsize=1)
 def unit_rays(camera: CameraModel) -> Array:
-    """[H, W, 3] directions of the pixels, camera frame."""
+    """[H, W, 3] directions of the pixels, camera frame; kept, as most views have one camera."""
     rays = camera.unproject(camera.pixel_centres())
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    rays = np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    rays.flags.writeable = False
+    return rays
 
 
 def surface_normals(
     rays: Array,  # [H, W, 3] unit
     ranges: Array,  # [H, W]
+    stride: int = 1,
 ) -> Array:
-    """[H, W, 3] unit normals towards the camera, camera frame; NaN where a neighbour is missing."""
+    """Unit normals towards the camera, camera frame, of every ``stride``-th pixel of every
+    ``stride``-th row, [ceil(H / stride), ceil(W / stride), 3]; NaN where a neighbour is missing."""
     points, step = rays * ranges[..., None], SLOPE_PX
-    normals = np.full_like(points, np.nan)
-    right = points[step:-step, 2 * step :] - points[step:-step, : -2 * step]
-    down = points[2 * step :, step:-step] - points[: -2 * step, step:-step]
-    across = np.cross(down, right)
+    height, width = ranges.shape
+    first = -(-step // stride) * stride
+
+    def beside(rows: int, columns: int) -> Array:
+        return points[
+            first + rows : height - step + rows : stride,
+            first + columns : width - step + columns : stride,
+        ]
+
+    across = np.cross(beside(step, 0) - beside(-step, 0), beside(0, step) - beside(0, -step))
+    normals = np.full((-(-height // stride), -(-width // stride), 3), np.nan)
+    inner = (slice(first // stride, first // stride + count) for count in across.shape[:2])
     with np.errstate(invalid="ignore", divide="ignore"):
-        normals[step:-step, step:-step] = across / np.linalg.norm(across, axis=-1, keepdims=True)
+        normals[tuple(inner)] = across / np.linalg.norm(across, axis=-1, keepdims=True)
     return normals
 
 
