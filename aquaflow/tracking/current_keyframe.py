@@ -67,6 +67,9 @@ class CurrentKeyframe:
     """From the frame before to the last one; while a frame is placed, what it is expected to be."""
     interval_ns: int = 0
     """Between the frames of ``motion``; 0 while it is not known."""
+    after_gap: bool = False
+    """No picture came for so long before the frame that is placed, or before those lost since, that
+    nothing says how far the camera went."""
     matches: Float | None = None
     """[H, W, 2] px of the last frame: where the next one's are looked for."""
     t_ns: int = 0
@@ -87,9 +90,10 @@ class CurrentKeyframe:
         much longer or shorter as the time since then."""
         interval_ns = t_ns - self.t_ns if self.t_ns > 0 else 0
         if measured is not None:
-            self.motion = measured
+            self.motion, self.after_gap = measured, False
         elif interval_ns > 0 and self.interval_ns > 0:
             stretch = interval_ns / self.interval_ns
+            self.after_gap |= stretch > MOST_STRETCH
             if 1.0 / MOST_STRETCH <= stretch <= MOST_STRETCH:
                 self.motion = Sim3.exp(stretch * self.motion.log())
         self.interval_ns = interval_ns
@@ -101,7 +105,7 @@ class CurrentKeyframe:
     ) -> None:
         """Update after a frame got its pose."""
         self.motion = T_fk @ self.T_fk.inverse()
-        self.T_fk, self.matches = T_fk, matches
+        self.T_fk, self.matches, self.after_gap = T_fk, matches, False
 
     def tracked_result(
         self,
@@ -147,7 +151,22 @@ class KeyframeTracker:
         camera: CameraModel,
         pair: PairGeometry | None = None,
     ) -> Matched | None:
-        """The frame's pose against the current keyframe; None where too few matches support one."""
+        """The frame's pose against the current keyframe; None where too few matches support one.
+
+        After a gap none that much of the picture contradicts: pictures of two places may have a
+        fifth of their matches in common. What is then found is found by keypoints.
+        """
+        solved = self._place(at, encoding, camera, pair)
+        unsure = solved is not None and at.after_gap and self._wide_steps.is_contradicted(solved)
+        return None if unsure else solved
+
+    def _place(
+        self,
+        at: CurrentKeyframe,
+        encoding: Encoding,
+        camera: CameraModel,
+        pair: PairGeometry | None,
+    ) -> Matched | None:
         predicted, seed = at.motion @ at.T_fk, None
         if pair is None:
             seed = self._seed(at, predicted, camera)
@@ -173,6 +192,8 @@ class KeyframeTracker:
         yet: the little that is known fits any pose."""
         if solved is not None and solved.known_share >= self._config.least_known_share:
             return solved
+        if at.after_gap:  # the step before says nothing of this one's length
+            return None
         reference, predicted = self._reference(at), at.motion @ at.T_fk
         turned = self._wide_steps.after_turn(at.keyframe, reference, encoding, camera, predicted)
         by_chance = solved is not None and match_by_chance(solved.pair)
