@@ -166,6 +166,10 @@ def deserialise(
 # --- views ----------------------------------------------------------------------------------------
 
 
+OF_SOME_VIEWS = ("light", "explained")
+"""Tensors that a view has, or None."""
+
+
 def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
     numbers = [
         (v.frame_index, v.keyframe, v.robust, v.looks, v.moments[2], cameras.index(v.camera))
@@ -178,12 +182,35 @@ def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
         "views.log_gains": log_gains_of(views) if views else np.zeros((0, 3)),
         "views.moments": np.array(moments, np.float64).reshape(-1, 12),
     }
-    for i, view in enumerate(views):
-        if view.light is not None:
-            arrays[f"views.light{i}"] = checkpoint_out(view.light)
-        if view.explained is not None:
-            arrays[f"views.explained{i}"] = checkpoint_out(view.explained)
+    for name in OF_SOME_VIEWS:
+        arrays |= _joined(f"views.{name}", [getattr(view, name) for view in views])
     return arrays
+
+
+def _joined(name: str, values: Sequence[Tensor | None]) -> Arrays:
+    """Tensors of as many axes in three arrays: as an array each, those of an hour's views would
+    take a checkpoint's reader ten times as long as all the rest."""
+    known = {i: checkpoint_out(value) for i, value in enumerate(values) if value is not None}
+    if not known:
+        return {}
+    return {
+        f"{name}.of": np.array(list(known), np.int64),
+        f"{name}.shapes": np.array([value.shape for value in known.values()], np.int64),
+        f"{name}.values": np.concatenate([value.ravel() for value in known.values()]),
+    }
+
+
+def _separate(name: str, arrays: Mapping[str, Any]) -> dict[int, Any]:
+    """What :func:`_joined` joined, by place."""
+    if f"{name}.of" not in arrays:
+        return {}
+    shapes, values = arrays[f"{name}.shapes"], arrays[f"{name}.values"]
+    ends = np.cumsum(shapes.prod(axis=1))
+    if len(values) != ends[-1]:
+        raise DamagedError("its views have other shapes than their light")
+    parts = np.split(values, ends[:-1])
+    places = arrays[f"{name}.of"].tolist()
+    return {i: part.reshape(shape) for i, part, shape in zip(places, parts, shapes, strict=True)}
 
 
 def deserialise_views(
@@ -199,6 +226,7 @@ def deserialise_views(
     cameras = [to_camera(values) for values in facts["cameras"]]
     views = []
     rows = (arrays[f"views.{name}"] for name in ("numbers", "poses", "log_gains", "moments"))
+    of_some = {name: _separate(f"views.{name}", arrays) for name in OF_SOME_VIEWS}
     for i, (numbers, pose, log_gain, moments) in enumerate(zip(*rows, strict=True)):
         index, keyframe, robust, looks, count, camera = numbers.tolist()
         T_wc, of_outliers = to_sim3(pose), bool(robust)
@@ -206,9 +234,10 @@ def deserialise_views(
         set_log_gain(view, log_gain.copy())
         view.looks = looks
         view.moments = (moments[:6].copy(), moments[6:].copy(), count)
-        for name in ("light", "explained"):
-            if f"views.{name}{i}" in arrays:
-                setattr(view, name, checkpoint_in(arrays[f"views.{name}{i}"], device))
+        for name, known in of_some.items():
+            value = known.get(i, arrays.get(f"views.{name}{i}"))  # the latter before 2026-11-29
+            if value is not None:
+                setattr(view, name, checkpoint_in(value, device))
         views.append(view)
     return views
 
