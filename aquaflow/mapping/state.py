@@ -187,7 +187,10 @@ def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
     return arrays
 
 
-def _joined(name: str, values: Sequence[Tensor | None]) -> Arrays:
+def _joined(
+    name: str,
+    values: Sequence[Tensor | None],  # [...] each
+) -> Arrays:
     """Tensors of as many axes in three arrays: as an array each, those of an hour's views would
     take a checkpoint's reader ten times as long as all the rest."""
     known = {i: checkpoint_out(value) for i, value in enumerate(values) if value is not None}
