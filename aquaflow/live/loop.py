@@ -75,7 +75,7 @@ class LiveLoop:
         self._frame_s = now_s()
         self._pictured = False
         self._overtaken_before = feed.newest.overtaken
-        self._ever_posed = any(tracked.T_wc is not None for tracked in run.results)
+        self._ever_posed = any(T_kf is not None for _, T_kf in run.slam.frames)
         self._unposed = LOST_AFTER
         """Frames in a row without a pose."""
         self._failed_in_a_row = 0

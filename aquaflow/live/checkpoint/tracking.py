@@ -90,11 +90,11 @@ def deserialise(
     camera = to_camera(facts["camera"])
     slam.resume(FrameTable.of_rows(arrays["frames"], camera), int(facts["used"]))
     run.first_pose_s = facts["first_pose_s"]
-    posed = [tracked for tracked in slam.results() if tracked.T_wc is not None]
-    if not posed:
+    rows = reversed(range(len(slam.frames)))
+    row = next((i for i in rows if slam.frames[i][1] is not None), None)
+    last = None if row is None else slam.results(row)[0].T_wc
+    if last is None:
         raise InputError("it holds no pose")
-    last = posed[-1].T_wc
-    assert last is not None
     slam.tracker.resume(camera, float(facts["focal_sigma"]), int(facts["sub_maps"]), last)
     run.notes += facts["notes"]
     if slam.in_base is not None and "in_site" in facts:
