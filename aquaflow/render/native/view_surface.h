@@ -22,7 +22,7 @@ struct ViewSurface {
 };
 
 struct PlaceInView {
-  double u, v, z, range;
+  double u, v, range;
 };
 
 // False of what lies nearer than a depth.
@@ -34,8 +34,7 @@ inline bool find_in_view(const ViewSurface& view, const double* place, double ne
   const double y = R[1] * dx + R[4] * dy + R[7] * dz;
   const double z = R[2] * dx + R[5] * dy + R[8] * dz;
   if (!(z > nearest_z)) return false;  // nor what is no number
-  *out = {view.fx * x / z + view.cx, view.fy * y / z + view.cy, z,
-          std::sqrt(x * x + y * y + z * z)};
+  *out = {view.fx * x / z + view.cx, view.fy * y / z + view.cy, std::sqrt(x * x + y * y + z * z)};
   return true;
 }
 

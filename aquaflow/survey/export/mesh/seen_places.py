@@ -24,7 +24,7 @@ from aquaflow.survey.export.mesh.view_surfaces import (
     truncation,
 )
 from aquaflow.survey.export.ortho.drawing import Colours
-from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX
+from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ray_information
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -59,11 +59,7 @@ def look_at(
 ) -> ObservedColours:
     """How the views see ``places`` of the surface; with the compiled kernels, or by numpy."""
     sums = ColourSums.of(places)
-    for number in surfaces.around(places.min(axis=0), places.max(axis=0)):
-        if library is None:
-            sums.add_by_numpy(surfaces, number, voxel)
-        else:
-            sums.add_compiled(library, surfaces, number, voxel)
+    _add_views(sums, surfaces, voxel, library)
     return ObservedColours(sums.total / np.maximum(sums.weights, 1e-30)[:, None], sums.nearest)
 
 
@@ -87,11 +83,7 @@ def place_sigmas(
     in widths of a pixel there, of the nearest view; infinite of what fewer than two views see.
     With the compiled kernels, or by numpy."""
     sums = RaySums.of(places)
-    for number in surfaces.around(places.min(axis=0), places.max(axis=0)):
-        if library is None:
-            sums.add_by_numpy(surfaces, number, voxel)
-        else:
-            sums.add_compiled(library, surfaces, number, voxel)
+    _add_views(sums, surfaces, voxel, library)
     least = np.linalg.eigvalsh(sums.information)[:, 0]
     known = least > 0.0
     sigma = np.where(known, 1.0 / np.sqrt(np.where(known, least, 1.0)), np.inf)
@@ -166,9 +158,8 @@ class RaySums:
         """Add what one view says, readable."""
         seen, view = _see(surfaces, number, self.places, voxel), surfaces.views[number]
         rays = (self.places[seen.which] - view.T_uc.t) / seen.ranges[:, None]
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
         width = seen.ranges / view.camera.fx
-        self.information[seen.which] += across / ((PICTURE_SIGMA_PX * width) ** 2)[:, None, None]
+        self.information[seen.which] += ray_information(rays, PICTURE_SIGMA_PX * width)
         self.footprint[seen.which] = np.minimum(self.footprint[seen.which], width)
 
     def add_compiled(
@@ -179,6 +170,17 @@ class RaySums:
         sums = (each.ctypes.data for each in (self.information, self.footprint))
         out = _NativeInformation(PICTURE_SIGMA_PX, *sums)
         library.call("aq_add_information", ctypes.byref(given), ctypes.byref(out))
+
+
+def _add_views(
+    sums: ColourSums | RaySums, surfaces: ViewSurfaces, voxel: float, library: Library | None
+) -> None:
+    """Add what each view says that may show some of the places."""
+    for number in surfaces.around(sums.places.min(axis=0), sums.places.max(axis=0)):
+        if library is None:
+            sums.add_by_numpy(surfaces, number, voxel)
+        else:
+            sums.add_compiled(library, surfaces, number, voxel)
 
 
 @dataclass(frozen=True)

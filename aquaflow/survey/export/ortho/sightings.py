@@ -131,9 +131,8 @@ class ViewRanges:
             seen, directions, ranges = self._seen_by(number, points)
             count[seen] += 1
             nearest[seen] = np.minimum(nearest[seen], ranges)
-            across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
             sigma = PICTURE_SIGMA_PX / self._views[number].camera.fx * ranges
-            information[seen] += across / (sigma**2)[:, None, None]
+            information[seen] += ray_information(directions, sigma)
         return PointSightings(count, _height_sigma(information, count), nearest)
 
     def hold(
@@ -195,6 +194,15 @@ class ViewRanges:
         z = self._of(number)
         same = np.abs(z[rows, columns] - ranges) <= SAME_RANGE * ranges
         return inside[same], offset[same] / ranges[same][:, None], ranges[same]
+
+
+def ray_information(
+    directions: Array,  # [K, 3] unit
+    sigma: Array,  # [K]
+) -> Array:
+    """[K, 3, 3] of the places of points, from rays that are each known to ``sigma`` across."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    return np.asarray(across / (sigma**2)[:, None, None])
 
 
 def _height_sigma(
