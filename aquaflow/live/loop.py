@@ -75,6 +75,7 @@ class LiveLoop:
         self._frame_s = now_s()
         self._pictured = False
         self._overtaken_before = feed.newest.overtaken
+        self._ever_posed = any(T_kf is not None for _, T_kf in run.slam.frames)
         self._unposed = LOST_AFTER
         """Frames in a row without a pose."""
         self._failed_in_a_row = 0
@@ -194,7 +195,7 @@ class LiveLoop:
         """Record whether the newest frame has a pose; a skipped frame does not count."""
         if tracked is not None and tracked.T_wc is not None:
             self.latest = tracked.bare()
-            self._unposed = 0
+            self._ever_posed, self._unposed = True, 0
         elif tracked is None or tracked.frame_class is not FrameClass.SKIPPED:
             self._unposed += 1
 
@@ -252,7 +253,7 @@ class LiveLoop:
             self._pictured,
             silent_camera(devices),
             self._unposed < LOST_AFTER,
-            self.dive_run.first_pose_s is not None,
+            self._ever_posed,
             inconsistency(slam.tracker.monitor.trouble),
             [
                 *of_the_machine(self.degradation, self.pressure, self.config.limits),
