@@ -67,7 +67,10 @@ class MediumConfig(StageConfig):
         True, description="False: backscatter is held to be as bright all over the picture"
     )
     fit_views: Lab[int] = Field(
-        20, ge=4, description="views that a fit looks at, spread over the dive"
+        20,
+        ge=4,
+        description="views that a fit looks at: spread over the dive, or in groups that see the "
+        "same ground, where those do not",
     )
     priors: Lab[WaterPriorsConfig] = WaterPriorsConfig()
     open_water: Literal["kept", "removed", "black"] = Field(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
@@ -33,6 +34,7 @@ from aquaflow.mapping.gaussians import (
     tracked_range,
     worth_keeping,
 )
+from aquaflow.mapping.looks import absorbed_colours, follow_water, kept_looks
 from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.mapping.optimisation import (
     MapOptimiser,
@@ -105,7 +107,9 @@ class Mapper:
         """Views on whose ground nothing waits; None: all."""
         self._objective = Objective(config.loss, renderer.threads)
         self.optimiser = MapOptimiser(config, self.scene, self._objective)
-        self.water_fitting = WaterFitting(config.medium, self.scene, self._random, self.failures)
+        self.water_fitting = WaterFitting(
+            config.medium, self.scene, self._random, self.failures, self.tiles
+        )
 
     # --- growing ------------------------------------------------------------------------------
 
@@ -118,8 +122,7 @@ class Mapper:
             self.views.append(view)
             if self._here is not None:
                 self._here.append(view)
-        # What waits cannot follow a change of the water.
-        if not self.tiles.waiting and self.water_fitting.go_on(self.views):
+        if self.water_fitting.go_on(self.views, self._here):
             with self.failures.contain("sunlight"):
                 self.scene.sunlight.judge(in_time(self.views))
 
@@ -291,11 +294,12 @@ class Mapper:
         z: Tensor,  # [M] ranges of what the view shows, map units
     ) -> Sphere | None:
         """Bring back what waits on the ground that ``view`` shows; where that is, as far as it is
-        known."""
-        can_wait = self.tiles.files.usable and self.device.type == "cpu" and self.neural is None
-        if not can_wait or len(z) == 0:
+        known, and where something can wait."""
+        if len(z) == 0:
             return None
         ground = self.tiles.look(view, float(z.median()))
+        if not self.tiles.files.usable or self.device.type != "cpu" or self.neural is not None:
+            return None
         self._bring(self.tiles.near(ground))
         if len(self.gaussians) > self.config.max_gaussians:
             self._let_leave(ground)
@@ -314,11 +318,13 @@ class Mapper:
             return
         self.scene.go_on()
         self.optimiser.settle()
-        self.optimiser.keep(self.tiles.leave(self.gaussians, self.optimiser.adam, keyframes))
+        seen = kept_looks(self.scene, self.views)
+        stay = self.tiles.leave(self.gaussians, self.optimiser.adam, keyframes, seen)
+        self.optimiser.keep(stay)
         self._find_views_here()
 
     def _bring(self, keyframes: Sequence[int]) -> None:
-        """Let these tiles be in memory again, where they are as they left."""
+        """Let these tiles be in memory again, where they look as they did when they left."""
         if not keyframes:
             return
         self.scene.go_on()
@@ -326,17 +332,28 @@ class Mapper:
         for keyframe in keyframes:
             with self.failures.contain("tile of the map"):
                 tile, arrays = self.tiles.bring(keyframe)
+                follow_water(self.scene, self.views, tile, arrays)
                 whole.append(tile)
                 states.append(arrays)
-        self.gaussians.append(whole)
-        self.optimiser.take_back(states)
+        if states:
+            self.gaussians.append(whole)
+            self.optimiser.take_back(states)
         self._find_views_here()
+
+    def _come_back_to(self, view: View) -> None:
+        """Let the ground that ``view`` shows be in memory."""
+        if self.tiles.waiting and view.keyframe in self.tiles.seen:
+            self._fill_around(self.tiles.seen[view.keyframe])
 
     def _fill_around(self, ground: Sphere) -> None:
         """Let as much of what lies around ``ground`` be in memory as there is room for."""
         leaving, coming = self.tiles.around(self.gaussians, ground, self.config.max_gaussians)
         self._release(leaving)
         self._bring(coming)
+
+    @property
+    def _views_here(self) -> list[View]:
+        return self.views if self._here is None else self._here
 
     def _find_views_here(self) -> None:
         if not self.tiles.waiting:
@@ -372,7 +389,16 @@ class Mapper:
             self.neural.move(moved)
         move_views(self.views, moves)
         self.tiles.move(moves)
+        self._change_unit(moves)
         self.water_fitting.follow_moves(moves)
+
+    def _change_unit(self, moves: Mapping[int, Sim3]) -> None:
+        """The water's rates are per map unit: as much as that has changed on the mean."""
+        keyframes = {view.keyframe for view in self.views}
+        logs = [math.log(moves[number].scale) for number in keyframes & moves.keys()]
+        if any(logs):
+            scale = math.exp(sum(logs) / len(keyframes))
+            self.scene.use_unit_and_light(scale, torch.ones(3, device=self.device))
 
     def use_unit(self, metres_per_unit: float) -> None:
         """The map's unit is known in metres, in which spacing and a decoder's voxels are given."""
@@ -383,16 +409,20 @@ class Mapper:
     def absorb(self, other: Mapper) -> None:
         """Take over another sub-map's Gaussians and views, already moved into this one's world.
 
-        The water stays this map's own: it is the same water, and is fitted again to all views. So
-        does the decoder: what the other's says of its Gaussians, seen from its own views, is kept.
+        The water stays this map's own: it is the same water, and is fitted again to all views; till
+        then the other's Gaussians get the colours that look the same in it. So does the decoder:
+        what the other's says of its Gaussians, seen from its own views, is kept.
         """
         self.scene.go_on()
-        count, views = len(other.gaussians), in_time(dict.fromkeys([*self.views, *other.views]))
+        before, count = len(self.gaussians), len(other.gaussians)
+        views = in_time(dict.fromkeys([*self.views, *other.views]))
         # Only a decoder needs to know from where each is seen: cameras times Gaussians.
         centres = None if self.neural is None else other.scene.bake(other.views)
+        colours = absorbed_colours(self.scene, other.scene, other.views)
         self.gaussians.append(other.gaussians)
+        self.gaussians.parameters["raw_colours"][before:] = colours
         self.tiles.absorb(other.tiles)
-        self.water_fitting.begin_again()
+        self.water_fitting.merge(views)
         self.views = views  # from here on make_whole mends what a failure leaves
         self.optimiser.extend(count, centres)
         self.optimiser.steps += other.steps
@@ -407,8 +437,7 @@ class Mapper:
         self.scene.go_on()
         if len(self.gaussians) == 0:
             return
-        views = self.views if self._here is None else self._here
-        chosen = sampled_views(views, steps, NEWEST_SHARE, self._random)
+        chosen = sampled_views(self._views_here, steps, NEWEST_SHARE, self._random)
         self.scene.centre_water(self.views)
         with self.scene.learning_from(chosen), self.optimiser.stepping():
             for view in chosen:
@@ -436,11 +465,11 @@ class Mapper:
             if progress is not None:
                 progress(next(done), steps)
 
+        if not until.over:
+            self.water_fitting.at_once(self.views, self._come_back_to)
         if self.tiles.waiting:
             self._refine_by_turns(steps, stepped, until)
         else:
-            if not until.over:
-                self.water_fitting.at_once(self.views)
             self._refine_views(self.views, steps, stepped, until)
         with self.failures.contain("white balance"):
             rebalance(self.scene)
@@ -453,8 +482,7 @@ class Mapper:
         while views and not until.over:
             keyframe, left = min(views), views.total()
             self._fill_around(self.tiles.seen[keyframe])
-            here = self.views if self._here is None else self._here
-            turn = [view for view in here if view.keyframe in views]
+            turn = [view for view in self._views_here if view.keyframe in views]
             for each in {keyframe, *(view.keyframe for view in turn)}:
                 del views[each]
             share = round(steps * (1.0 - views.total() / whole)) - done

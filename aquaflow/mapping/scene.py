@@ -105,7 +105,14 @@ class Scene:
         ``gain`` times as large, before views whose exposures are as much smaller."""
         self.medium.use_unit_and_light(scale, gain)
         if self.lamp is not None:
-            self.lamp = replace(self.lamp, range=scale * self.lamp.range)
+            self.lamp = self.lamp.rescale(scale)
+        if self.balance is not None:
+            mean = tuple((water_out(gain) * self.balance.mean).tolist())
+            near_range = scale * self.balance.near_range
+            self.balance = replace(self.balance, near_range=near_range, mean=mean)
+        if self.seen_nearest is not None:
+            near, views = self.seen_nearest
+            self.seen_nearest = replace(near, z=scale * near.z), views
         self.exposes = self.exposes or bool((gain != 1.0).any())
 
     def centre_water(self, views: Sequence[View]) -> None:

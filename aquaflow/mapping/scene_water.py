@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -14,18 +14,17 @@ import torch
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MediumConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians import raw_colour
+from aquaflow.mapping.looks import looks, recoloured, water_of
 from aquaflow.mapping.scene import Scene, orientations
-from aquaflow.render.contract import radiance
+from aquaflow.mapping.tiles import Sphere, Tiles
 from aquaflow.render.transfers import water_in, water_out
 from aquaflow.render.views import View, in_time
 from aquaflow.water.estimation import WaterEstimate, estimating, models_for
-from aquaflow.water.exposure import gain_of, log_gains_of, set_log_gains
-from aquaflow.water.medium import WaterParameters
+from aquaflow.water.exposure import log_gains_of, set_log_gains
 from aquaflow.water.model import shading_basis
 from aquaflow.water.nearest import kept_by
 from aquaflow.water.observations import run_to_end
-from aquaflow.water.sightings import PosedPicture, sighting
+from aquaflow.water.sightings import MIN_VIEWS, PosedPicture, sighting
 from aquaflow.water.white_balance import WhiteBalance
 
 
@@ -36,7 +35,7 @@ def rebalance(scene: Scene) -> None:
         return
     near, views = scene.seen_nearest
     which = water_in(near.view, scene.device, torch.int64)
-    basis, water = shading_basis(near.xy), _water_of(scene, views, which)
+    basis, water = shading_basis(near.xy), water_of(scene, views, which)
     log_gain = (basis @ scene.shading)[:, None]
     if scene.exposes:
         log_gain = log_gain + log_gains_of(views)[near.view]
@@ -48,18 +47,24 @@ def rebalance(scene: Scene) -> None:
 
 
 def fitting_water(
-    scene: Scene, views: Sequence[View], generator: torch.Generator
+    scene: Scene,
+    views: Sequence[View],
+    generator: torch.Generator,
+    come_to: Callable[[View], None] | None = None,
 ) -> Generator[None, None, tuple[WaterEstimate | None, list[View]]]:
     """Estimate water, shading and exposure from what ``views`` saw; the scene stays as it is.
 
-    Pauses every few milliseconds. Returns the estimate, None while too little is seen from
-    several ranges, and the views that it was fitted to: those that still have their pixels.
+    ``come_to`` is told of each view before it is drawn. Pauses every few milliseconds. Returns the
+    estimate, None while too little is seen from several ranges, and the views that it was fitted
+    to: those that still have their pixels.
     """
     if not scene.config.fit or len(scene.gaussians) == 0:
         return None, []
     pictures, fitted = [], []
     for view in views:
         if view.has_pixels:
+            if come_to is not None:
+                come_to(view)
             shown = scene.show(view)
             pictures.append(PosedPicture(view, shown.z, shown.alpha))
             fitted.append(view)
@@ -110,14 +115,13 @@ def _adopt(
 ) -> None:
     """Let the estimate hold, and give every Gaussian the radiance that looks the same in it.
 
-    The same from the camera nearest to it: where it is seen best.
+    The same from that camera of the dive which is nearest to it: where it is seen best.
     """
     shown, (_, z, nearest) = (
-        scene.bake_parameters(list(fitted))["raw_colours"],
-        scene.nearest_cameras(fitted),
+        scene.bake_parameters(list(dive))["raw_colours"],
+        scene.nearest_cameras(dive),
     )
-    old = _water_of(scene, fitted, nearest) if scene.medium.active else None
-    old_gains = torch.stack([gain_of(view) for view in fitted])
+    before = looks(scene, dive, nearest, z)
     scene.medium.active = estimate.model.water
     if estimate.model.water:
         found = [estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness]
@@ -134,13 +138,7 @@ def _adopt(
     scene.gain_maps.clear()
     set_log_gains(dive, fitted, estimate.exposure)
 
-    new = _water_of(scene, fitted, nearest) if scene.medium.active else None
-    seen = radiance(shown)
-    if old is not None:
-        seen = seen * old.transmission(z) + old.backscatter(z)
-    new_gains = torch.stack([gain_of(view) for view in fitted])
-    seen = seen * (old_gains / new_gains)[nearest]
-    wanted = raw_colour(seen if new is None else new.restore(seen, z)[0])
+    wanted = recoloured(shown, before, looks(scene, dive, nearest, z))
     raw = scene.gaussians.parameters["raw_colours"]
     # A decoder's residuals come on top again.
     raw.copy_(wanted if scene.neural is None else wanted + (raw - shown))
@@ -154,14 +152,52 @@ def _as_chosen(scene: Scene, estimate: WaterEstimate) -> WhiteBalance | None:
     return replace(estimate.balance, chosen=scene.balance.chosen)
 
 
-def _water_of(
-    scene: Scene,
+# --------------------------------------------------------------------------------------------------
+# Which views it is fitted to: a patch of the surface says something where several see it.
+
+GROUP = 5
+"""Views of one ground: two more than must see a patch, as none shows all of it."""
+NEAR = 0.5
+"""Distance of two grounds over their radius up to which they are mostly the same."""
+SHARING = 0.5
+"""Share of the views that are spread over a dive's time that must see the same ground as others."""
+
+
+def views_to_fit(
     views: Sequence[View],
-    which: torch.Tensor,  # [N] int64
-) -> WaterParameters:
-    """The water for N points, each seen from its own view: beta_a is [N, 3]."""
-    water = scene.waters(orientations(views, scene.device))
-    return replace(water, beta_a=water.beta_a[which])
+    seen: Mapping[int, Sphere],  # by keyframe
+    most: int,
+) -> list[View]:
+    """Up to ``most`` of the views, in the order of their frames: those spread over the dive's time
+    where they see the same ground; if not, as in long dives, groups that do, each from as different
+    ranges as there are."""
+    ordered = in_time(views)
+    count = min(most, len(ordered))
+    spread = [ordered[i] for i in np.linspace(0, len(ordered) - 1, count).astype(int)]
+    known = [view for view in ordered if view.keyframe in seen]
+    if len(ordered) <= most or len(known) <= most or _share_ground(spread, seen):
+        return spread
+    ground = np.stack([seen[view.keyframe].centre for view in known])
+    places = np.stack([view.T_wc.t for view in known])
+    chosen, groups = set[int](), max(most // GROUP, 1)
+    for anchor in np.linspace(0, len(known) - 1, 2 * groups + 1).astype(int)[1::2]:
+        reach = NEAR * seen[known[anchor].keyframe].radius
+        near = np.flatnonzero(np.linalg.norm(ground - ground[anchor], axis=1) <= reach)
+        by_range = near[np.argsort(np.linalg.norm(places[near] - ground[anchor], axis=1))]
+        chosen |= set(by_range[np.linspace(0, len(near) - 1, GROUP).astype(int)].tolist())
+    return [known[i] for i in sorted(chosen)]
+
+
+def _share_ground(views: Sequence[View], seen: Mapping[int, Sphere]) -> bool:
+    """Whether most of the ``views`` see ground that enough others see; True where it is unknown."""
+    spheres = [seen[view.keyframe] for view in views if view.keyframe in seen]
+    if not spheres:
+        return True
+    centres = np.stack([sphere.centre for sphere in spheres])
+    radii = np.array([sphere.radius for sphere in spheres])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    near = apart <= NEAR * np.maximum(radii[:, None], radii)
+    return bool((near.sum(axis=1) >= MIN_VIEWS).mean() >= SHARING)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -186,17 +222,24 @@ class WaterFitting:
         scene: Scene,
         generator: torch.Generator,
         failures: Failures,
+        tiles: Tiles | None = None,
     ) -> None:
+        """``tiles`` know on what ground the keyframes have looked."""
         self.config, self.scene, self.failures = config, scene, failures
+        self._tiles = Tiles() if tiles is None else tiles
         self._random = generator
         self.next_fit = config.first_fit_views
         """Number of views at which the next fit begins."""
         self._under_way: Generator[None, None, None] | None = None
 
-    def go_on(self, views: Sequence[View]) -> bool:
-        """A few steps, if there is a fit to be made; True if it has ended with them."""
-        if self._under_way is None and len(views) >= self.next_fit:
-            self._under_way = self._fitting(views)
+    def go_on(self, views: Sequence[View], here: Sequence[View] | None = None) -> bool:
+        """A few steps, if there is a fit to be made; True if it has ended with them.
+
+        ``here``: those of the ``views`` whose ground is in memory, which it looks at; None: all.
+        """
+        here = views if here is None else here
+        if self._under_way is None and here and len(views) >= self.next_fit:
+            self._under_way = self._fitting(views, here)
         if self._under_way is None:
             return False
         ended = True
@@ -206,10 +249,10 @@ class WaterFitting:
             self._end(views)
         return ended
 
-    def at_once(self, views: Sequence[View]) -> None:
-        """A whole fit, from its beginning."""
+    def at_once(self, views: Sequence[View], come_to: Callable[[View], None] | None = None) -> None:
+        """A whole fit, from its beginning; ``come_to`` lets a view's ground be in memory."""
         with self.failures.contain("water fit"):
-            run_to_end(self._fitting(views))
+            run_to_end(self._fitting(views, views, come_to))
         self._end(views)
 
     def follow_moves(self, moves: Mapping[int, Sim3]) -> None:
@@ -222,16 +265,24 @@ class WaterFitting:
         with the next view."""
         self._under_way = None
 
+    def merge(self, views: Sequence[View]) -> None:
+        """The map has those of another: a fit to all ``views`` begins with the next one."""
+        self.begin_again()
+        self.next_fit = min(self.next_fit, len(views))
+
     def _end(self, views: Sequence[View]) -> None:
         self._under_way = None
         self.next_fit = max(self.next_fit, 2 * len(views))
 
-    def _fitting(self, views: Sequence[View]) -> Generator[None, None, None]:
-        """To views spread over the dive so far; pauses every few milliseconds."""
-        ordered = in_time(views)
-        count = min(self.config.fit_views, len(ordered))
-        chosen = np.linspace(0, len(ordered) - 1, count).astype(int)
-        fit = fitting_water(self.scene, [ordered[i] for i in chosen], self._random)
+    def _fitting(
+        self,
+        views: Sequence[View],
+        here: Sequence[View],
+        come_to: Callable[[View], None] | None = None,
+    ) -> Generator[None, None, None]:
+        """To some of those ``here``; pauses every few milliseconds."""
+        looked_at = views_to_fit(here, self._tiles.seen, self.config.fit_views)
+        fit = fitting_water(self.scene, looked_at, self._random, come_to)
         estimate, fitted = yield from fit
         if estimate is None:
             return

@@ -208,15 +208,21 @@ class Tiles:
         return leaving, [n for n in out if n in chosen]
 
     def leave(
-        self, gaussians: GaussianMap, adam: SelectiveAdam, keyframes: Sequence[int]
+        self,
+        gaussians: GaussianMap,
+        adam: SelectiveAdam,
+        keyframes: Sequence[int],
+        seen: Mapping[str, torch.Tensor],  # [N, ...] each
     ) -> torch.Tensor:
-        """Write the Gaussians of ``keyframes``; [N] bool, those that are to stay in memory."""
+        """Write the Gaussians of ``keyframes``, and how they are ``seen``, ``z`` the range; [N]
+        bool, those that are to stay in memory."""
         owners, spheres, _ = _spheres(gaussians)
         found = dict(zip(owners.tolist(), spheres, strict=True))
         stay = torch.ones(len(gaussians), dtype=torch.bool)
         for keyframe in keyframes:
             mine = gaussians.keyframes == keyframe
             arrays = {"steps": adam.steps[mine].numpy()}
+            arrays |= {name: each[mine].numpy() for name, each in seen.items()}
             for name, tensor in gaussians.parameters.items():
                 arrays[name] = tensor[mine].numpy()
                 arrays[f"first.{name}"] = adam.first_moments[name][mine].numpy()
@@ -241,6 +247,8 @@ class Tiles:
         gaussians.extend(new, keyframe)
         if tile.move is not None:
             move_gaussians(gaussians, {keyframe: tile.move})
+            if "z" in arrays:  # not in files written before 2026-11-29
+                arrays["z"] = arrays["z"] * np.float32(tile.move.scale)
         return gaussians, arrays
 
     def move(self, moves: Mapping[int, Sim3]) -> None:

@@ -123,7 +123,8 @@ def test_without_any_time_nothing_is_refined_and_no_water_fitted(
 def test_the_water_is_fitted_before_refining(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = grown(settings(optimiser={"refine_steps": 1}))
     fits: list[int] = []
-    monkeypatch.setattr(mapper.water_fitting, "at_once", lambda views: fits.append(mapper.steps))
+    note = lambda *views_and_ground: fits.append(mapper.steps)  # noqa: E731
+    monkeypatch.setattr(mapper.water_fitting, "at_once", note)
     before = mapper.steps
     mapper.refine()
     assert fits == [before]

@@ -31,8 +31,8 @@ ROOM = 1000
 SURVEY = SurveyPictures(64)
 
 
-def config(room: int = ROOM) -> MappingConfig:
-    return settings().model_copy(update={"max_gaussians": room})
+def config(room: int = ROOM, **optimiser: int) -> MappingConfig:
+    return settings(optimiser=optimiser).model_copy(update={"max_gaussians": room})
 
 
 def view_at(index: int) -> View:
@@ -147,7 +147,7 @@ def test_refining_comes_to_all_ground_though_memory_has_no_room_for_a_neighbourh
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapper = mapped(30, tmp_path).mappers[0]
-    mapper.config = config(ROOM // 20)
+    mapper.config = config(ROOM // 20, refine_steps=20)  # for each of 72 memories
     steps = learned_while_refining(mapper, monkeypatch)
     mapper.refine()
     assert set(steps) == set(range(30))
@@ -169,9 +169,7 @@ def test_grounds_share_the_time_of_refining(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapper, ticks = mapped(30, tmp_path).mappers[0], itertools.count()
-    mapper.config = mapper.config.model_copy(
-        update={"optimiser": mapper.config.optimiser.model_copy(update={"refine_steps": 10_000})}
-    )
+    mapper.config = config(refine_steps=10_000)
     steps = learned_while_refining(mapper, monkeypatch)
     mapper.refine(until=Deadline(300.0, lambda: float(next(ticks))))
     assert set(steps) == set(range(30))
@@ -200,6 +198,7 @@ def test_a_tile_whose_file_is_lost_costs_itself(tmp_path: Path, contained: objec
     mapper = maps.mappers[0]
     mapper._release([1, 2])
     files_in(tmp_path)[0].unlink()
+    mapper._bring([1])
     mapper.gather()
     assert mapper.tiles.waiting == {}
     assert {1, 2} & set(mapper.gaussians.keyframes.tolist()) == {2}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +15,21 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import scene_water as module
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.scene_water import STEPS, WaterFitting, fitting_water
+from aquaflow.mapping.scene_water import STEPS, WaterFitting, fitting_water, views_to_fit
+from aquaflow.mapping.tiles import Sphere, TileFiles
 from aquaflow.render.views import View
 from aquaflow.water.estimation import WaterEstimate
-from tests.mapping.mapping_scenes import filmed, floor, pose, renderer, settings, view_of, water
+from aquaflow.water.sightings import MIN_VIEWS
+from tests.mapping.mapping_scenes import (
+    filmed,
+    flat_pointmap,
+    floor,
+    pose,
+    renderer,
+    settings,
+    view_of,
+    water,
+)
 
 PAUSES = 5
 
@@ -34,7 +46,11 @@ class Fits:
         self.fails = False
 
     def __call__(
-        self, scene: Scene, views: Sequence[View], generator: torch.Generator
+        self,
+        scene: Scene,
+        views: Sequence[View],
+        generator: torch.Generator,
+        come_to: Callable[[View], None] | None = None,
     ) -> Generator[None, None, tuple[WaterEstimate | None, list[View]]]:
         self.looked.append([view.frame_index for view in views])
         for _ in range(PAUSES):
@@ -96,6 +112,73 @@ def test_a_fit_begins_again_when_the_maps_unit_has_changed(fits: Fits) -> None:
     paced.follow_moves({0: Sim3(np.eye(3), np.zeros(3), 1.1)})
     paced.go_on(views(4))
     assert fits.looked == [[0, 1], [0, 1, 2, 3]]
+
+
+def test_a_fit_looks_at_views_whose_ground_is_in_memory(fits: Fits) -> None:
+    paced = fitting(first_fit_views=2)
+    dive = views(9)
+    paced.go_on(dive, dive[5:])
+    assert fits.looked == [[5, 6, 7, 8]]
+
+
+def test_a_map_that_has_taken_over_another_is_fitted_with_the_next_view(fits: Fits) -> None:
+    paced = fitting(first_fit_views=2)
+    paced.at_once(views(8))
+    paced.go_on(views(9))
+    paced.merge(views(12))
+    paced.go_on(views(13))
+    assert fits.looked == [list(range(8)), list(range(13))]
+
+
+# --- which views it looks at ----------------------------------------------------------------------
+
+
+def survey(
+    count: int, step: float, height: Callable[[int], float] = lambda i: 1.0
+) -> tuple[list[View], dict[int, Sphere]]:
+    """Views that look down along a line, and the ground that each has seen."""
+    seen = {}
+    line = views(count)
+    for i, view in enumerate(line):
+        view.keyframe, view.T_wc = i, pose((step * i, 0.0, -height(i)))
+        seen[i] = Sphere(np.array([step * i, 0.0, 0.0]), height(i))
+    return line, seen
+
+
+def test_where_all_see_the_same_ground_they_are_spread_over_time() -> None:
+    line, seen = survey(60, 0.02)
+    chosen = [view.frame_index for view in views_to_fit(line, seen, 6)]
+    assert chosen == np.linspace(0, 59, 6).astype(int).tolist()
+
+
+def test_over_a_long_way_they_are_groups_that_see_the_same_ground() -> None:
+    line, seen = survey(2000, 0.1)
+    chosen = views_to_fit(line[::-1], seen, 20)
+    places = np.array([seen[view.keyframe].centre for view in chosen])
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    assert len(chosen) == 20
+    assert [view.frame_index for view in chosen] == sorted(view.frame_index for view in chosen)
+    assert ((apart < 1.0).sum(axis=1) >= MIN_VIEWS).all()
+    assert np.ptp(places[:, 0]) > 0.6 * 200.0
+
+
+def test_of_one_ground_they_are_those_with_the_most_different_ranges() -> None:
+    line, seen = survey(2000, 0.1, lambda i: 1.0 + 0.05 * (i % 7))
+    heights = [-view.T_wc.t[2] for view in views_to_fit(line, seen, 20)]
+    assert min(heights) == pytest.approx(1.0)
+    assert max(heights) == pytest.approx(1.3)
+
+
+def test_views_whose_ground_is_unknown_are_spread_over_time() -> None:
+    line, _ = survey(50, 5.0)
+    assert views_to_fit(line, {}, 5) == [line[i] for i in (0, 12, 24, 36, 49)]
+
+
+def test_a_mappers_fit_knows_the_ground_that_its_keyframes_saw(tmp_path: Path) -> None:
+    mapper = Mapper(settings(), renderer(), 0, tiles=TileFiles(tmp_path))
+    view = filmed(floor(), [pose((0.0, 0.0, 0.0))])[0]
+    mapper.insert(view, flat_pointmap())
+    assert mapper.water_fitting._tiles.seen.keys() == {0}
 
 
 def test_a_fit_that_fails_is_counted_and_not_tried_again_at_once(fits: Fits) -> None:
