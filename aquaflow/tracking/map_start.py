@@ -20,6 +20,11 @@ from aquaflow.tracking.pose.matcher import pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, solve_pose
 from aquaflow.types import Frame
 
+MOST_FOLLOWED = 4
+"""Frames by which a live dive goes on from its first keyframe. The newest shares the least with it:
+posed by it alone, one over a flat seabed was 0.65 units off, and all after it
+(notes/2026-11-tracking.md#live-start)."""
+
 
 @dataclass(frozen=True)
 class PosedFrame:
@@ -58,8 +63,8 @@ class MapStart:
         failures: Failures,
         in_step: bool,
     ) -> None:
-        """A map that is not made ``in_step`` with the frames goes on from the newest one: the
-        others wait for idle time."""
+        """A map that is not made ``in_step`` with the frames goes on by a few of them up to the
+        newest one: the others wait for idle time."""
         self._prior, self._config = prior, config
         self._waiting, self._failures, self._in_step = waiting, failures, in_step
         self._initialiser: Initialiser | None = None
@@ -144,7 +149,8 @@ class MapStart:
         unsure = [each.frame for each in initialiser.waiting if each.frame.index not in counted]
         self._waiting.put(unsure, Wait.THINNED)
         if not self._in_step:
-            return replace(start, posed=posed[-1:], T_waiting=solution.T[-1])
+            step = -(-len(posed) // MOST_FOLLOWED)
+            return replace(start, posed=posed[::-step][::-1], T_waiting=solution.T[-1])
         thinned = [PosedFrame(frame) for frame in self._waiting.of(Wait.THINNED)]
         in_order = sorted([*posed, *thinned], key=lambda each: each.frame.index)
         return replace(start, posed=in_order)
