@@ -111,16 +111,22 @@ def kept_looks(
 def follow_water(
     scene: Scene,
     views: Sequence[View],  # of the map
-    tile: GaussianMap,
-    kept: Arrays,  # as from kept_looks, and of any others; z in the unit of now
+    gaussians: GaussianMap,
+    kept: Sequence[Arrays],  # by tile, in their order, as from kept_looks; z in the unit of now
 ) -> None:
-    """Let Gaussians that come back look as they did when they left."""
-    if "veil" not in kept:  # not in files written before 2026-11-29
+    """Let the Gaussians of tiles that come back look as they did when they left."""
+    parts = [each for each in kept if "veil" in each]  # not in files written before 2026-11-29
+    if not parts:
         return
-    z, factor, veil = (torch.from_numpy(kept[name]) for name in ("z", "factor", "veil"))
-    raw = tile.parameters["raw_colours"]
-    now = looks(scene, *_first_views(views, tile.keyframes), z)
-    raw.copy_(recoloured(raw, Looks(factor, veil), now))
+    known = np.repeat(["veil" in each for each in kept], [len(each["steps"]) for each in kept])
+    rows = torch.from_numpy(np.flatnonzero(known))
+    z, factor, veil = (
+        torch.from_numpy(np.concatenate([each[name] for each in parts]))
+        for name in ("z", "factor", "veil")
+    )
+    raw = gaussians.parameters["raw_colours"]
+    now = looks(scene, *_first_views(views, gaussians.keyframes[rows]), z)
+    raw[rows] = recoloured(raw[rows], Looks(factor, veil), now)
 
 
 def _first_views(

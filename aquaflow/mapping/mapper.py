@@ -332,10 +332,11 @@ class Mapper:
         for keyframe in keyframes:
             with self.failures.contain("tile of the map"):
                 tile, arrays = self.tiles.bring(keyframe)
-                follow_water(self.scene, self.views, tile, arrays)
                 whole.append(tile)
                 states.append(arrays)
         if states:
+            with self.failures.contain("tile of the map"):
+                follow_water(self.scene, self.views, whole, states)
             self.gaussians.append(whole)
             self.optimiser.take_back(states)
         self._find_views_here()

@@ -225,15 +225,15 @@ class MapOptimiser:
     ) -> None:
         """Give the map's last Gaussians the rows with which they left."""
         self.settle()
-        joined = {
-            name: torch.from_numpy(np.concatenate([arrays[name] for arrays in states]))
-            for name in states[0]
-        }
+
+        def joined(name: str) -> Tensor:
+            return torch.from_numpy(np.concatenate([arrays[name] for arrays in states]))
+
         names = self.scene.gaussians.NAMES
         first, second = (
-            {n: joined[f"{which}.{n}"] for n in names} for which in ("first", "second")
+            {n: joined(f"{which}.{n}") for n in names} for which in ("first", "second")
         )
-        self.adam.extend_with(joined["steps"], first, second)
+        self.adam.extend_with(joined("steps"), first, second)
         self.adam.bind(self.scene.gaussians.parameters)
 
     def keep(

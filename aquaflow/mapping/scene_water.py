@@ -184,7 +184,8 @@ def views_to_fit(
         reach = NEAR * seen[known[anchor].keyframe].radius
         near = np.flatnonzero(np.linalg.norm(ground - ground[anchor], axis=1) <= reach)
         by_range = near[np.argsort(np.linalg.norm(places[near] - ground[anchor], axis=1))]
-        chosen |= set(by_range[np.linspace(0, len(near) - 1, GROUP).astype(int)].tolist())
+        spread_over = np.linspace(0, len(near) - 1, min(GROUP, most)).astype(int)
+        chosen |= set(by_range[spread_over].tolist())
     return [known[i] for i in sorted(chosen)]
 
 

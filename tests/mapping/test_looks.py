@@ -13,14 +13,13 @@ from torch import Tensor
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.looks import Looks, recoloured
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.scene_water import adopt_water, fitting_water
 from aquaflow.mapping.tiles import TileFiles
 from aquaflow.render.contract import radiance
 from aquaflow.render.views import View
-from aquaflow.water.observations import run_to_end
 from tests.mapping.mapping_scenes import (
     FLOOR_M,
     filmed,
+    fit_water,
     flat_pointmap,
     floor,
     picture,
@@ -178,11 +177,10 @@ def test_another_fit_keeps_the_pictures_of_ground_that_it_did_not_look_at() -> N
     there.frame_index, dive = 9, [*looked_at, there]
 
     def fit() -> None:
-        fits = fitting_water(mapper.scene, looked_at, torch.Generator().manual_seed(0))
-        estimate, fitted = run_to_end(fits)
+        drawn = torch.Generator().manual_seed(0)
+        estimate = fit_water(mapper.scene, looked_at, drawn, dive)
         assert estimate is not None
         assert estimate.model.water
-        adopt_water(mapper.scene, estimate, fitted, dive)
 
-    assert FLOOR_M < 30.0
+    assert mapper.scene.nearest_cameras(looked_at)[1].max() > 10.0 * FLOOR_M
     assert change_of(mapper, [there], fit) < 0.01

@@ -29,6 +29,8 @@ STEP = 8
 """Pictures from one keyframe to the next: 0.4 m of the way."""
 ROOM = 1000
 SURVEY = SurveyPictures(64)
+KEPT_LOOKS = ("z", "factor", "veil")
+"""Not in files of tiles written before 2026-11-29."""
 
 
 def config(room: int = ROOM, **optimiser: int) -> MappingConfig:
@@ -85,6 +87,17 @@ def test_tiles_leave_and_come_back_bit_for_bit(tmp_path: Path) -> None:
     mapper.gather()
     assert mapper.tiles.waiting == {}
     assert files_in(tmp_path) == []
+    assert equal(before, state_of(mapper))
+
+
+def test_tiles_of_before_and_since_looks_are_kept_come_back_together(tmp_path: Path) -> None:
+    mapper = mapped(8, tmp_path, 100_000).mappers[0]
+    before = state_of(mapper)
+    mapper._release([0, 3, 4])
+    number = mapper.tiles.waiting[3].number
+    older = {k: v for k, v in mapper.tiles.files.read(number).items() if k not in KEPT_LOOKS}
+    mapper.tiles.files._spill[number] = older
+    mapper.gather()
     assert equal(before, state_of(mapper))
 
 

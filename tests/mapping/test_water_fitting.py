@@ -162,6 +162,11 @@ def test_over_a_long_way_they_are_groups_that_see_the_same_ground() -> None:
     assert np.ptp(places[:, 0]) > 0.6 * 200.0
 
 
+def test_they_are_never_more_than_were_asked_for() -> None:
+    line, seen = survey(2000, 0.1)
+    assert len(views_to_fit(line, seen, 4)) == 4
+
+
 def test_of_one_ground_they_are_those_with_the_most_different_ranges() -> None:
     line, seen = survey(2000, 0.1, lambda i: 1.0 + 0.05 * (i % 7))
     heights = [-view.T_wc.t[2] for view in views_to_fit(line, seen, 20)]
