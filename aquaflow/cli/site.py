@@ -16,6 +16,7 @@ from aquaflow.cli.console import Json, progress_bars
 if TYPE_CHECKING:
     from aquaflow.survey.change.site_refinement import RefinedMap
     from aquaflow.survey.site.merged_file import MergedSite
+    from aquaflow.survey.site.merging import Progress
 
 Site = Annotated[Path, typer.Argument(help="Site folder.")]
 
@@ -40,11 +41,21 @@ def add(
 
 
 @app.command()
-def merge(site: Site, as_json: Json = False) -> None:
+def merge(
+    site: Site,
+    jobs: Annotated[int | None, typer.Option(help="Dives looked up at once; else one.")] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="Look them up on a Ray cluster: auto | host:6379 | ray://host:10001"),
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Recognise the dives of a site in each other, and optimise them together."""
     from aquaflow.survey.site.merging import merge as merged_site
 
     with progress_bars(quiet=as_json) as progress:
+        if jobs is not None or cluster is not None:
+            _look_up_elsewhere(site, jobs, cluster, progress)
         merged = merged_site(site, progress)
     if as_json:
         typer.echo(json.dumps(_numbers(merged)))
@@ -52,6 +63,34 @@ def merge(site: Site, as_json: Json = False) -> None:
     for line in _in_words(merged):
         typer.echo(line)
     typer.echo(f"Written to {site}: merged.json, merged.npy, paths/.")
+
+
+LOOK_UP_MB = 300
+"""What a process takes that looks a dive up, 1e6 bytes: 170 of it libraries, 77 the keypoints that
+it holds (links.KEPT)."""
+
+
+def _look_up_elsewhere(
+    site: Path, jobs: int | None, cluster: str | None, progress: Progress
+) -> None:
+    """Look the dives up in other processes; what fails there is left to the merge."""
+    from aquaflow.config.stage import COMMAND_LINE, validate
+    from aquaflow.lab.batch.batch import run_calls
+    from aquaflow.lab.batch.job import BatchConfig, CallJob
+    from aquaflow.survey.site.merging import look_ups
+
+    asked = validate(BatchConfig, {"jobs": jobs, "cluster": cluster}, COMMAND_LINE)
+    where = str(site.resolve())
+    calls = [
+        CallJob(
+            each.name, "aquaflow.survey.site.merging:look_up",
+            {"site": where, "dive": each.dive, "among": each.among}, len(each.among), LOOK_UP_MB,
+        )
+        for each in look_ups(site)
+    ]  # fmt: skip
+    failed = run_calls(calls, site, "look-ups", asked, progress) if calls else {}
+    for name, why in failed.items():
+        typer.echo(f"Looking up {name} failed elsewhere and is done here: {why}.", err=True)
 
 
 @app.command("map")

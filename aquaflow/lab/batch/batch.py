@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,12 +19,12 @@ from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.whole_folder import FolderLock, remove_abandoned
 from aquaflow.config import Config
 from aquaflow.config.mapping import BYTES_PER_GAUSSIAN
-from aquaflow.lab.batch.job import WRITTEN, BatchConfig, BatchJob
+from aquaflow.lab.batch.job import WRITTEN, BatchConfig, BatchJob, CallJob
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
 from aquaflow.lab.batch.recordings import Recording, find_recordings
 from aquaflow.lab.batch.run_job import KILOBYTE, MEGABYTE
-from aquaflow.lab.batch.season import JOURNAL, Journal, Season, run_season
+from aquaflow.lab.batch.season import JOURNAL, End, Journal, Season, failed_jobs, run_season
 from aquaflow.lab.batch.site import DIVES, Sites, add_members, make_site
 from aquaflow.lab.batch.workers import LocalWorkers, Workers
 
@@ -80,6 +80,34 @@ def run_batch(
                 ObjectStore(site).write(JOURNAL, read_regular(folder / JOURNAL))
     written = [n for n, outcome in season.outcomes.items() if outcome.state in WRITTEN]
     return Batched(jobs, season, add_members(site, sorted(written), sites))
+
+
+def run_calls(
+    jobs: Sequence[CallJob], folder: Path, what: str, batch: BatchConfig, progress: Progress
+) -> dict[str, str]:
+    """Call the functions of all ``jobs``, of which the journal is in ``folder``; why one came to
+    nothing, by name.
+
+    Raises:
+        InputError: the journal cannot be written, or there is no cluster any more.
+        KeyboardInterrupt: so it was stopped.
+    """
+    journal = Journal(folder / JOURNAL)
+    try:
+        journal.write("begun", calls=len(jobs), cluster=batch.cluster)
+        season = run_season(
+            jobs, _workers(batch), journal, batch.retries,
+            lambda done, total: progress(what, done, total),
+        )  # fmt: skip
+    finally:
+        journal.close()
+    if season.end is End.STOPPED:
+        raise KeyboardInterrupt
+    if season.end is End.NO_WORKERS:
+        raise InputError(season.reason)
+    undone = "it was not begun"
+    failed = [job.name for job in failed_jobs(season, jobs)]
+    return {n: season.outcomes[n].sentence if n in season.outcomes else undone for n in failed}
 
 
 @contextlib.contextmanager

@@ -1,4 +1,5 @@
-"""One dive as a job: everything that its bytes depend on, and what came of it."""
+"""A job: a dive, with everything that its bytes depend on, or the call of a function; and what came
+of it."""
 
 from __future__ import annotations
 
@@ -52,18 +53,44 @@ class BatchJob:
         return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
     def to_json(self) -> dict[str, Any]:
-        """The job for :meth:`of_json` on another machine."""
+        """The job for :func:`job_of_json` on another machine."""
         return asdict(self)
 
-    @classmethod
-    def of_json(cls, content: dict[str, Any]) -> BatchJob:
-        """The job that :meth:`to_json` described."""
-        return cls(**content)
+
+@dataclass(frozen=True)
+class CallJob:
+    """A call of a function of AquaFlow in a process of its own; goes to another as JSON."""
+
+    name: str
+    """By which the journal knows it."""
+    function: str
+    """``module:name``; it takes ``arguments``, and what it returns is left."""
+    arguments: dict[str, Any]
+    """By name; JSON."""
+    size_bytes: int
+    """As of a recording: the longest is begun first."""
+    memory_mb: int
+    """Estimate of its peak, 1e6 bytes."""
+    threads: int = 1
+    """Cores that it takes."""
+    version: str = __version__
+
+    def to_json(self) -> dict[str, Any]:
+        """The job for :func:`job_of_json` on another machine."""
+        return asdict(self)
+
+
+Job = BatchJob | CallJob
+
+
+def job_of_json(content: dict[str, Any]) -> Job:
+    """The job that ``to_json`` described."""
+    return CallJob(**content) if "function" in content else BatchJob(**content)
 
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """What came of one attempt."""
+    """What came of one attempt at a job."""
 
     state: State
     """``done``, ``poor`` (with a warning), ``failed``, ``lost`` or ``full`` (disk)."""

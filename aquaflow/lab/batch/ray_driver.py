@@ -17,8 +17,8 @@ import threading
 from typing import IO, Any
 
 from aquaflow.base.errors import first_line
-from aquaflow.lab.batch.job import BatchJob, BatchOutcome
-from aquaflow.lab.batch.mapping_process import end_with
+from aquaflow.lab.batch.job import BatchOutcome, Job, job_of_json
+from aquaflow.lab.batch.job_process import end_with
 from aquaflow.lab.batch.run_job import MEGABYTE, run_job
 
 LOOK_S = 0.5
@@ -27,7 +27,7 @@ LOOK_S = 0.5
 
 def attempt(content: dict[str, Any]) -> dict[str, Any]:
     """One attempt at the job that ``content`` describes, on a node."""
-    return run_job(BatchJob.of_json(content)).to_json()
+    return run_job(job_of_json(content)).to_json()
 
 
 class Cluster:
@@ -52,7 +52,7 @@ class Cluster:
         """What each node that is alive has in all, by Ray's names."""
         return [dict(node["Resources"]) for node in self._ray.nodes() if node["Alive"]]
 
-    def start(self, job: BatchJob) -> None:
+    def start(self, job: Job) -> None:
         """Queue ``job``, where its cores and memory will be free; one that is too large for every
         node gets a whole one."""
         nodes = self.nodes()
@@ -110,7 +110,7 @@ def _serve(cluster: Cluster, asked: queue.SimpleQueue[str | None], answers: IO[s
             continue
         if line is None:
             return
-        cluster.start(BatchJob.of_json(json.loads(line)))
+        cluster.start(job_of_json(json.loads(line)))
 
 
 def _say(answers: IO[str], **what: Any) -> None:

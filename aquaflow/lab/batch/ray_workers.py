@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.batch.job import BatchJob, BatchOutcome
+from aquaflow.lab.batch.job import BatchOutcome, Job
 
 PROGRAM = "aquaflow.lab.batch.ray_driver"
 JOIN_S = 90.0
@@ -55,12 +55,12 @@ class RayWorkers:
             self.close()
             raise
 
-    def takes(self, job: BatchJob) -> bool:
+    def takes(self, job: Job) -> bool:
         """True until the cluster has some more than it can work on: it packs them itself."""
         most = max(1, int(self._cores)) * (1 + QUEUED_PER_CORE)
         return len(self._running) < (most if self._most is None else min(most, self._most))
 
-    def start(self, job: BatchJob) -> None:
+    def start(self, job: Job) -> None:
         """Hand the job to the cluster."""
         assert self._process.stdin is not None
         self._running.add(job.name)

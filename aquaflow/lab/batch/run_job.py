@@ -1,4 +1,4 @@
-"""One attempt at one dive, wherever it is made: the same function on this machine and on a node."""
+"""One attempt at one job, wherever it is done: the same function on this machine and on a node."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from signal import Signals
-from typing import Any
+from typing import IO, Any
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import working_folder
-from aquaflow.lab.batch.job import WRITTEN, BatchJob, BatchOutcome
+from aquaflow.lab.batch.job import WRITTEN, BatchJob, BatchOutcome, CallJob, Job
+from aquaflow.lab.batch.job_process import outcome_of_failure
 from aquaflow.lab.batch.manifest import write_manifest
-from aquaflow.lab.batch.mapping_process import outcome_of_failure
 from aquaflow.lab.batch.object_store import ObjectStore, StoreError, is_url
 from aquaflow.lab.batch.site import DiveStore, open_site
 
-PROGRAM = "aquaflow.lab.batch.mapping_process"
+PROGRAM = "aquaflow.lab.batch.job_process"
 KILOBYTE = 1024
 """Bytes; what Linux counts resident sets in."""
 MEGABYTE = 1e6
 """Bytes."""
 
 
-def run_job(job: BatchJob, started: RunningProcesses | None = None) -> BatchOutcome:
-    """Make the dive of ``job`` if it is not there yet; raises nothing.
+def run_job(job: Job, started: RunningProcesses | None = None) -> BatchOutcome:
+    """Make the dive of ``job`` if it is not there yet, or call its function; raises nothing.
 
     ``started`` is told of the process, so that it can be stopped.
     """
@@ -50,12 +51,14 @@ def run_job(job: BatchJob, started: RunningProcesses | None = None) -> BatchOutc
     return replace(outcome, node=socket.gethostname(), wall_s=round(time.monotonic() - begin_s, 3))
 
 
-def _attempt(job: BatchJob, started: RunningProcesses) -> BatchOutcome:
+def _attempt(job: Job, started: RunningProcesses) -> BatchOutcome:
     if job.version != __version__:
         raise InputError(
             f"{socket.gethostname()} has AquaFlow {__version__}, the batch is of {job.version}; "
             "install the same on every machine"
         )
+    if isinstance(job, CallJob):
+        return _call(job, started)
     site = open_site(job.site)
     found = site.finished_outcome(job)
     if found is not None:
@@ -76,10 +79,15 @@ def _make(job: BatchJob, site: DiveStore, work: Path, started: RunningProcesses)
     return outcome
 
 
+def _call(job: CallJob, started: RunningProcesses) -> BatchOutcome:
+    asked = {"function": job.function, "arguments": job.arguments, "parent": os.getpid()}
+    with tempfile.TemporaryFile() as said:
+        return _ask(job, asked, said, started)
+
+
 def _map(
     job: BatchJob, source: str, work: Path, dive: Path, started: RunningProcesses
 ) -> BatchOutcome:
-    """Map in a new process, and wait for it."""
     calibration = None
     if job.calibration is not None:
         calibration = work / "camera.yaml"
@@ -89,12 +97,19 @@ def _map(
         "calibration": None if calibration is None else str(calibration),
     }  # fmt: skip
     with (work / "said").open("w+b") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=said, env=_environment(job.threads), start_new_session=True,
-        )  # fmt: skip
-        with started.running(process):
-            return _answer(process, json.dumps(asked).encode(), job.memory_mb)
+        return _ask(job, asked, said, started)
+
+
+def _ask(
+    job: Job, asked: dict[str, Any], said: IO[bytes], started: RunningProcesses
+) -> BatchOutcome:
+    """Start a process for the job, and wait for it."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=said, env=_environment(job.threads), start_new_session=True,
+    )  # fmt: skip
+    with started.running(process):
+        return _answer(process, json.dumps(asked).encode(), job.memory_mb)
 
 
 def _environment(threads: int) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""A batch: every recording becomes a dive, once, whoever makes it and whatever dies meanwhile."""
+"""A batch: every job is done, once, whoever does it and whatever dies meanwhile."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.atomic import is_cut_short, open_to_append
-from aquaflow.lab.batch.job import WRITTEN, BatchJob, BatchOutcome
+from aquaflow.lab.batch.job import WRITTEN, BatchOutcome, Job
 from aquaflow.lab.batch.workers import Workers
 
 LOOK_S = 0.5
@@ -47,21 +47,21 @@ class Season:
 class _Queue:
     """Jobs that wait, and how often each was tried."""
 
-    waiting: deque[BatchJob]
+    waiting: deque[Job]
     attempts: dict[str, int] = field(default_factory=dict)
-    running: dict[str, BatchJob] = field(default_factory=dict)
+    running: dict[str, Job] = field(default_factory=dict)
 
 
 def run_season(
-    jobs: Sequence[BatchJob],
+    jobs: Sequence[Job],
     workers: Workers,
     journal: Journal,
     retries: int,
     ended: Callable[[int, int], None],
 ) -> Season:
-    """Make every dive of ``jobs``; one whose process dies is tried ``retries`` times more.
+    """Do all ``jobs``; one whose process dies is tried ``retries`` times more.
 
-    Long dives are begun first, so that none is left at the end alone. ``ended`` is told how many
+    Long ones are begun first, so that none is left at the end alone. ``ended`` is told how many
     have ended, of how many. After a full disk nothing more is begun. Ctrl-C stops what runs.
     """
     longest_first = sorted(jobs, key=lambda job: (-job.size_bytes, job.name))
@@ -112,8 +112,8 @@ def _settle(
     season.outcomes[name] = outcome
 
 
-def failed_jobs(season: Season, jobs: Sequence[BatchJob]) -> list[BatchJob]:
-    """Jobs without a dive."""
+def failed_jobs(season: Season, jobs: Sequence[Job]) -> list[Job]:
+    """Jobs that were not done."""
     outcomes = season.outcomes
     return [j for j in jobs if j.name not in outcomes or outcomes[j.name].state not in WRITTEN]
 

@@ -1,4 +1,4 @@
-"""Who makes the dives: a protocol, and the processes of this machine."""
+"""Who does the jobs: a protocol, and the processes of this machine."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import queue
 import threading
 from typing import Protocol
 
-from aquaflow.lab.batch.job import BatchJob, BatchOutcome
+from aquaflow.lab.batch.job import BatchOutcome, Job
 from aquaflow.lab.batch.run_job import RunningProcesses, run_job
 
 
 class Workers(Protocol):
-    """Make dives, several at once; each by :func:`aquaflow.lab.batch.run_job.run_job`."""
+    """Do jobs, several at once; each by :func:`aquaflow.lab.batch.run_job.run_job`."""
 
-    def takes(self, job: BatchJob) -> bool:
+    def takes(self, job: Job) -> bool:
         """True if ``job`` may be started now."""
         ...
 
-    def start(self, job: BatchJob) -> None:
+    def start(self, job: Job) -> None:
         """Begin ``job``; returns at once.
 
         Raises:
-            InputError: there is no one any more who could make it.
+            InputError: there is no one any more who could do it.
         """
         ...
 
@@ -39,17 +39,17 @@ class Workers(Protocol):
 
 
 class LocalWorkers:
-    """A process for each dive, as many at once as cores and memory allow."""
+    """A process for each job, as many at once as cores and memory allow."""
 
     def __init__(self, cores: int, memory_mb: int, most: int | None = None) -> None:
-        """Use ``cores`` and ``memory_mb`` (1e6 bytes) for at ``most`` so many dives at once."""
+        """Use ``cores`` and ``memory_mb`` (1e6 bytes) for at ``most`` so many jobs at once."""
         self._cores, self._memory_mb, self._most = cores, memory_mb, most
-        self._jobs: dict[str, BatchJob] = {}
+        self._jobs: dict[str, Job] = {}
         self._ended: queue.SimpleQueue[tuple[str, BatchOutcome]] = queue.SimpleQueue()
         self._started = RunningProcesses()
         self._threads: list[threading.Thread] = []
 
-    def takes(self, job: BatchJob) -> bool:
+    def takes(self, job: Job) -> bool:
         """True if its cores and memory are free; one alone is always taken."""
         if not self._jobs:
             return True
@@ -61,15 +61,15 @@ class LocalWorkers:
             and sum(each.memory_mb for each in taken) + job.memory_mb <= self._memory_mb
         )
 
-    def start(self, job: BatchJob) -> None:
+    def start(self, job: Job) -> None:
         """Begin in a thread that waits for the process."""
         self._jobs[job.name] = job
         self._threads = [each for each in self._threads if each.is_alive()]
-        thread = threading.Thread(target=self._run, args=(job,), name=f"dive {job.name}")
+        thread = threading.Thread(target=self._run, args=(job,), name=job.name)
         self._threads.append(thread)
         thread.start()
 
-    def _run(self, job: BatchJob) -> None:
+    def _run(self, job: Job) -> None:
         self._ended.put((job.name, run_job(job, self._started)))
 
     def wait(self, timeout_s: float) -> tuple[str, BatchOutcome] | None:

@@ -131,6 +131,7 @@ def _require(site: Path, taking: Mapping[str, Taking], left_out: Mapping[str, st
         raise InputError(f"{site} has no dive that can be merged ({why or 'it is empty'})")
 
 
+_NO_LINKS = DiveLinks((), np.zeros(0, LINK))
 _WHY = {
     "changed": "it changed since it was added; add it again to use it as it is now",
     "missing": "its folder or its places.npz is gone; put it back, or map the dive again",
@@ -146,20 +147,34 @@ def _join(
 ) -> None:
     """Add the dives that are not in the joint graph yet: those that were looked up before first."""
     index = _index(site, taking, left_out)
-    known = {dive: read_links(site, dive) for dive in taking if dive not in joint.dives}
-    for dive in sorted(known, key=lambda each: known[each] is None):
+    for dive, known in _in_order(site, taking, joint):
         if dive not in taking:
             continue
-        links = known[dive] or DiveLinks((), np.zeros(0, LINK))
-        others = _links_from(site, joint.dives, dive, links) if known[dive] else []
-        covered = {*links.among, *(each for each, _ in others)}
-        among = [each for each in joint.dives if each not in covered]
-        if among or known[dive] is None:
+        links = known or _NO_LINKS
+        others = _links_from(site, joint.dives, dive, links) if known else []
+        among = _left(joint.dives, links, others)
+        if among or known is None:
             links += _look_up(site, taking, index, dive, among, progress)
             write_links(site, dive, links)
         joint.add(dive, taking[dive].places, taking[dive].frames)
         rows = [links_of(joint, dive, links), *(links_of(joint, *each) for each in others)]
         join(joint, np.concatenate(rows))
+
+
+def _in_order(
+    site: Path, taking: Mapping[str, Taking], joint: JointGraph
+) -> list[tuple[str, DiveLinks | None]]:
+    """The dives that join, and what looking them up found before; those where it is known first."""
+    new = [(dive, read_links(site, dive)) for dive in taking if dive not in joint.dives]
+    return sorted(new, key=lambda each: each[1] is None)
+
+
+def _left(
+    dives: Sequence[str], links: DiveLinks, others: Sequence[tuple[str, DiveLinks]]
+) -> list[str]:
+    """Those of ``dives`` that neither a dive was looked for in nor were looked for in it."""
+    covered = {*links.among, *(each for each, _ in others)}
+    return [each for each in dives if each not in covered]
 
 
 def _index(site: Path, taking: dict[str, Taking], left_out: dict[str, str]) -> PlaceIndex:
@@ -207,6 +222,63 @@ def _look_up(
     links = find_links(index, lambda each: taking[each].places, dive, among, advance)
     say(site, "looked_up", dive=name, among=len(among), links=len(links.rows))
     return links
+
+
+# --------------------------------------------------------------------------------------------------
+# The look-ups apart from the rest: any process may do each, in any order, and a merge finds on disk
+# what they found.
+
+
+@dataclass(frozen=True)
+class LookUp:
+    """A dive that is to be looked for in those that join before it."""
+
+    name: str
+    """Of the dive."""
+    dive: str
+    """Its fingerprint."""
+    among: tuple[str, ...]
+    """Those of the others."""
+
+
+def look_ups(site: Path) -> list[LookUp]:
+    """Those that :func:`merge` would do now; after this, the index holds every dive.
+
+    Raises:
+        InputError: as :func:`merge`.
+    """
+    dives = read_site(site)
+    lock = FolderLock(site)
+    try:
+        taking, left_out = _taking(site, dives)
+        joint = read_joint(site, {dive: each.frames for dive, each in taking.items()})
+        joint = joint or JointGraph()
+        _index(site, taking, left_out)
+        before, found = list(joint.dives), list[LookUp]()
+        for dive, known in _in_order(site, taking, joint):
+            links = known or _NO_LINKS
+            others = _links_from(site, before, dive, links) if known else []
+            if among := _left(before, links, others):
+                found.append(LookUp(taking[dive].dive.name, dive, tuple(among)))
+            elif known is None:
+                write_links(site, dive, _NO_LINKS)
+            before.append(dive)
+    finally:
+        lock.release()
+    return found
+
+
+def look_up(site: str, dive: str, among: Sequence[str]) -> None:
+    """Do one of :func:`look_ups`, of the site in the folder ``site``.
+
+    Raises:
+        InputError: a file is damaged, or cannot be written.
+    """
+    where = Path(site)
+    taking = {each.fingerprint: Taking(each, each.folder(where), {}) for each in read_site(where)}
+    index, known = read_index(where, taking), read_links(where, dive) or _NO_LINKS
+    links = known + _look_up(where, taking, index, dive, among, lambda *_: None)
+    write_links(where, dive, links)
 
 
 # --------------------------------------------------------------------------------------------------

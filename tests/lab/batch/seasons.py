@@ -21,7 +21,7 @@ POISON = """
 import os, pathlib, signal, sys, time
 from aquaflow.sources import open_recording
 
-MAPPING = "mapping_process" in " ".join(sys.orig_argv)
+MAPPING = "job_process" in " ".join(sys.orig_argv)
 
 class Poison:
     specificity = 9

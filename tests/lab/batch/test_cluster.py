@@ -14,6 +14,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.lab.batch import ray_workers
 from aquaflow.lab.batch.ray_workers import RayWorkers
+from aquaflow.survey.site.merging import add_to_site, merge
 from tests.lab.batch.ray_cluster import two_nodes
 from tests.lab.batch.seasons import (
     SHORT,
@@ -24,6 +25,7 @@ from tests.lab.batch.seasons import (
     season,
     wait_for,
 )
+from tests.survey.site.site_dives import Scene, stated_dive
 
 AQUAFLOW = str(Path(sys.executable).with_name("aquaflow"))
 
@@ -101,6 +103,29 @@ def test_a_killed_head_ends_the_batch_in_a_sentence_and_again_it_goes_on(
     outcomes = json.loads(said)["dives"]
     assert {name for name, each in outcomes.items() if each["earlier"]} == finished
     assert leftovers(site) == []
+
+
+@pytest.mark.slow
+def test_dives_looked_up_on_a_cluster_merge_as_those_looked_up_here(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    scene = Scene(1)
+    made = [
+        stated_dive(tmp_path / name, scene, start=0.2 * seed, seed=seed)
+        for seed, name in enumerate("abcd")
+    ]
+    for site in ("here", "there"):
+        add_to_site(tmp_path / site, made)
+    with two_nodes(environment) as cluster:
+        words = [AQUAFLOW, "site", "merge", str(tmp_path / "there"), "--cluster", cluster.address]
+        running = begin(environment, [*words, "--json"])
+        said, problem = running.communicate()
+    assert running.returncode == 0, problem + said
+    assert sorted(line["dive"] for line in events(tmp_path / "there", "done")) == ["b", "c", "d"]
+    merge(tmp_path / "here")
+    for name in ("merged.json", "merged.npy", "joint.npz"):
+        found = (tmp_path / "there" / name).read_bytes()
+        assert found == (tmp_path / "here" / name).read_bytes()
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from aquaflow.survey.site.checking import check_site
 from aquaflow.survey.site.links import DiveLinks, find_links
 from aquaflow.survey.site.manifest import SiteDive
 from aquaflow.survey.site.merged_file import MergedSite, read_merged
-from aquaflow.survey.site.merging import add_to_site, merge
+from aquaflow.survey.site.merging import add_to_site, look_up, look_ups, merge
 from aquaflow.survey.site.place_index import MOST_CANDIDATES
 from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from aquaflow.tracking.loops import Verified, verify_keypoints
@@ -130,6 +130,37 @@ def test_a_killed_merge_goes_on_with_the_next_dive(
     merge(site)
     assert len(looked_up) == 1
     assert (site / "merged.json").read_bytes() == (whole / "merged.json").read_bytes()
+
+
+def test_look_ups_done_apart_in_any_order_give_the_same_bytes(
+    dives: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = tmp_path / "site"
+    add_to_site(site, [dives / "a", dives / "b", dives / "elsewhere"])
+    wanted = look_ups(site)
+    assert [(each.name, len(each.among)) for each in wanted] == [("b", 1), ("elsewhere", 2)]
+    for each in reversed(wanted):
+        look_up(str(site), each.dive, list(each.among))
+    assert look_ups(site) == []
+    monkeypatch.setattr(merging, "find_links", None)  # there is nothing left to look up
+    merge(site)
+    assert {n: c for n, c in bytes_of(site).items() if n != "site.json"} == {
+        n: c for n, c in bytes_of(whole).items() if n != "site.json"
+    }
+
+
+def test_a_look_up_that_came_to_nothing_is_done_by_the_merge(tmp_path: Path) -> None:
+    scene, site = Scene(1), tmp_path / "site"
+    dives = [
+        stated_dive(tmp_path / f"{i}", scene, start=0.2 * i, seed=i, count=4) for i in range(3)
+    ]
+    add_to_site(site, dives)
+    last = look_ups(site)[-1]
+    look_up(str(site), last.dive, list(last.among))
+    found = merge(site)
+    assert [each["dives"] for each in found.components] == [["0", "1", "2"]]
+    pairs = {frozenset((link["a"]["dive"], link["b"]["dive"])) for link in found.links}
+    assert pairs == {frozenset("01"), frozenset("02"), frozenset("12")}
 
 
 def test_no_dive_is_changed(dives: Path, whole: Path, tmp_path: Path) -> None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
+from aquaflow.lab.batch import ray_workers, workers
+from aquaflow.lab.batch.job import BatchOutcome, Job
+from aquaflow.lab.batch.run_job import RunningProcesses
+from aquaflow.lab.batch.season import JOURNAL
 from tests.command_line import Cli
+from tests.lab.batch.seasons import read_journal
 from tests.survey.site.site_dives import Scene, stated_dive
 
 
@@ -42,3 +49,55 @@ def test_a_folder_that_is_no_site_is_refused_in_a_sentence(command: Cli, tmp_pat
     assert refused.code == 1
     assert refused.err.count("\n") == 1
     assert "is no site" in refused.err
+
+
+def test_look_ups_by_other_processes_give_the_same_merge(command: Cli, tmp_path: Path) -> None:
+    scene = Scene(1)
+    dives = [
+        stated_dive(tmp_path / name, scene, start=0.2 * seed, count=3, seed=seed)
+        for seed, name in enumerate("abc")
+    ]
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    for site in (alone, together):
+        command("site", "add", site, *dives)
+    command("site", "merge", alone)
+    said = command("site", "merge", together, "--jobs", "2", "--json")
+    assert [each["dives"] for each in json.loads(said.out)["components"]] == [["a", "b", "c"]]
+    events = [(each["event"], each.get("dive")) for each in read_journal(together / JOURNAL)]
+    assert sorted(name for event, name in events if event == "done" and name) == ["b", "c"]
+    assert (together / "merged.json").read_bytes() == (alone / "merged.json").read_bytes()
+    assert (together / "joint.npz").read_bytes() == (alone / "joint.npz").read_bytes()
+    assert command("site", "merge", together, "--jobs", "2").code == 0, "nothing is left to do"
+
+
+def test_a_look_up_that_fails_elsewhere_is_said_and_done_by_the_merge(
+    command: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(job: Job, started: RunningProcesses | None = None) -> BatchOutcome:
+        return BatchOutcome("failed", "its disk broke")
+
+    monkeypatch.setattr(workers, "run_job", lost)
+    scene, site = Scene(1), tmp_path / "site"
+    dives = [stated_dive(tmp_path / n, scene, count=3, seed=s) for s, n in enumerate("ab")]
+    command("site", "add", site, *dives)
+    said = command("site", "merge", site, "--jobs", "1")
+    assert said.code == 0
+    assert "b failed elsewhere and is done here: its disk broke" in said.err
+    assert "Component 0: a, b" in said.out
+
+
+def test_a_cluster_that_is_gone_is_told_in_a_sentence_and_merges_nothing(
+    command: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "no_driver.py").write_text('print(\'{"failed": "no such host"}\')')
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(ray_workers, "find_spec", lambda name: object())
+    monkeypatch.setattr(ray_workers, "PROGRAM", "no_driver")
+    scene, site = Scene(1), tmp_path / "site"
+    dives = [stated_dive(tmp_path / n, scene, count=3, seed=s) for s, n in enumerate("ab")]
+    command("site", "add", site, *dives)
+    refused = command("site", "merge", site, "--cluster", "127.0.0.1:9")
+    assert refused.code == 1
+    [line] = refused.err.splitlines()
+    assert "the Ray cluster at 127.0.0.1:9 cannot be used (no such host)" in line
+    assert not (site / "merged.json").exists()

@@ -1,5 +1,5 @@
-"""``python -m aquaflow.lab.batch.mapping_process``: one recording into one dive folder, in a
-process of its own, that a recording may crash without harm to others.
+"""``python -m aquaflow.lab.batch.job_process``: one job in a process of its own, that a recording
+may crash without harm to others: one recording into one dive folder, or a function's call.
 
 Reads a JSON object from stdin and prints one: the fields of an Outcome. What libraries print goes
 to stderr.
@@ -12,6 +12,7 @@ import json
 import os
 import signal
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,13 @@ def map_one(asked: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def call(asked: dict[str, Any]) -> dict[str, Any]:
+    """Call the function that is asked for; fields of an Outcome."""
+    module, _, name = asked["function"].partition(":")
+    getattr(import_module(module), name)(**asked["arguments"])
+    return {"state": "done"}
+
+
 def main() -> None:
     """Entry point of the process."""
     asked = json.load(sys.stdin)
@@ -76,7 +84,7 @@ def main() -> None:
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     try:
-        found = map_one(asked)
+        found = call(asked) if "function" in asked else map_one(asked)
     except Exception as error:
         found = outcome_of_failure(error)
     print(json.dumps(found), file=answer, flush=True)
