@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.config import InsertionConfig
-from aquaflow.geometry.similarity import Sim3, Sim3Batch, on_so3
+from aquaflow.geometry.similarity import Sim3, Sim3Batch, on_so3, quaternion_from_rotation
 from aquaflow.keyframes import Pointmap
 from aquaflow.render.contract import COLOUR_SHARPNESS, CPU, radiance
 from aquaflow.render.transfers import (
@@ -421,14 +421,11 @@ def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.T
     """
     if not moves or len(gaussians) == 0:
         return torch.zeros(0, dtype=torch.int64, device=gaussians.device)
-    ordered = [moves[number] for number in sorted(moves)]
-    columns = (
-        [S.R for S in ordered], [S.t for S in ordered], [S.quaternion for S in ordered],
-        [S.scale for S in ordered],
-    )  # fmt: skip
+    # All at once: one by one, the quaternions of 2000 keyframes would take 60 ms.
+    S = Sim3Batch.of([moves[number] for number in sorted(moves)])
     numbers, *tables = (
-        moves_in(torch.from_numpy(np.stack(column)), gaussians.device)
-        for column in (sorted(moves), *columns)
+        moves_in(torch.from_numpy(column), gaussians.device)
+        for column in (np.array(sorted(moves)), S.R, S.t, quaternion_from_rotation(S.R), S.scale)
     )
     rows = torch.nonzero(torch.isin(gaussians.keyframes, numbers))[:, 0]
     which = torch.searchsorted(numbers, gaussians.keyframes[rows])

@@ -175,7 +175,7 @@ def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
         (v.frame_index, v.keyframe, v.robust, v.looks, v.moments[2], cameras.index(v.camera))
         for v in views
     ]
-    moments = [[*v.moments[0], *v.moments[1]] for v in views]
+    moments = [v.moments[:2] for v in views]
     arrays = {
         "views.numbers": np.array(numbers, np.int64).reshape(-1, 6),
         "views.poses": of_sim3([view.T_wc for view in views]),
