@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config import Config, parse_config
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3

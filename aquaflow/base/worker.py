@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from threading import Event
 from typing import Any, TypeVar
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 
 T = TypeVar("T")

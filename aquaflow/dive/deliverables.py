@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import InputError
 from aquaflow.config.white_balance import DAYLIGHT
 from aquaflow.dive.calibration_pass import FoundCamera

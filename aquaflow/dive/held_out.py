@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.dive.held_out_example import Fidelity, HeldOut, Perceived
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.appearance import shown_tone

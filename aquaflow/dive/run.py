@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aquaflow.base.clocks.deadline import FinishTime
 from aquaflow.base.errors import InputError, NotMappedError, printable, times
 from aquaflow.base.stages import pace
 from aquaflow.config import Config
@@ -36,7 +37,7 @@ from aquaflow.mapping.work import MIN_VIEWS, Progress
 from aquaflow.recordings.kept_pictures import KeptPictures, PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryWriter
-from aquaflow.slam import FinishTime, Slam
+from aquaflow.slam import Slam
 from aquaflow.sources.picture_check import PictureCheck
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error

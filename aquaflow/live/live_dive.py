@@ -7,6 +7,7 @@ import shutil
 import sys
 from functools import partial
 
+from aquaflow.base.clocks.deadline import FinishTime
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState
 from aquaflow.base.worker import usable_threads
@@ -23,7 +24,6 @@ from aquaflow.live.health.heartbeats import ServiceHealth
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.idle_loop import FINISHING
 from aquaflow.mapping.work import Progress
-from aquaflow.slam import FinishTime
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config.service import LimitsConfig, ServiceConfig

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.worker import Lateness
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3

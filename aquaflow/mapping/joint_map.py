@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.optimisation import share_done, shuffled_views

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import InputError, is_device_failure, is_device_full
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Profiler
 from aquaflow.config import Config

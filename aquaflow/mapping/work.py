@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Profiler
 from aquaflow.geometry.arrays import Arrays

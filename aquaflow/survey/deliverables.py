@@ -5,7 +5,7 @@ What loads torch is imported when a map is there, so that a dive without one nev
 
 from __future__ import annotations
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.deliverables import Deliverable, DeliverablePhase

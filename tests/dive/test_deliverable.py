@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.dive import deliverables as module

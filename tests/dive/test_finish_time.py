@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aquaflow.base.clocks.deadline import EVALUATED, REFINED, SETTLED, FinishTime
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.held_out import spread
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.lab.evaluation.trajectory_error import read_tum
-from aquaflow.slam import EVALUATED, REFINED, SETTLED, FinishTime, Slam
+from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame
 

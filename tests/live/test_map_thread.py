@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.worker import Lateness
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.camera import guess_camera

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.optimisation import Rates, refining_rates

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config import Config
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians import GaussianMap

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config import Config, MappingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import Pointmap

@@ -3,7 +3,8 @@
     python -m tests.survey.long_deliverables DIVE [NAME ...]
 
 DIVE: of :mod:`tests.survey.long_dive`. Prints a JSON line for each NAME: CPU and wall seconds, the
-most memory, the size of what was written, and the last line of what was said.
+most memory, with and without pages of files, the size of what was written, and the last line of
+what was said.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ def measure(dive: Path, name: str, work: Path) -> dict[str, object]:
     began = time.monotonic()
     with tempfile.TemporaryFile() as said:
         process = subprocess.Popen(command(dive, name, work), stdout=said, stderr=subprocess.STDOUT)
-        timer = time.monotonic() + MOST_S
+        timer, own_kb = time.monotonic() + MOST_S, 0
         while True:
+            own_kb = max(own_kb, _own_kb(process.pid))
             pid, status, used = os.wait4(process.pid, os.WNOHANG)
             if pid:
                 break
@@ -62,9 +64,19 @@ def measure(dive: Path, name: str, work: Path) -> dict[str, object]:
         "cpu_s": round(used.ru_utime + used.ru_stime, 1),
         "wall_s": round(time.monotonic() - began, 1),
         "peak_mb": round(used.ru_maxrss / 1024.0),
+        "own_mb": round(own_kb / 1024.0),
         "out_mb": round(sum(f.stat().st_size for f in work.rglob("*") if f.is_file()) / 1e6, 1),
         "said": lines[-1][-200:] if lines else "",
     }  # fmt: skip
+
+
+def _own_kb(pid: int) -> int:
+    """What the process holds now, without pages of files, which the kernel takes back."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("RssAnon:")), 0)
 
 
 def main() -> None:

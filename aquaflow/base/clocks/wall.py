@@ -1,12 +1,10 @@
-"""The computer's clocks: the wall clock, which jumps during dives, and moments to be done by.
-
-Nothing but the log depends on the wall clock; what must end in time follows the monotonic one."""
+"""The computer's wall clock, which jumps during dives. Nothing but the log depends on it; what must
+end in time follows the monotonic one (deadline.py)."""
 
 from __future__ import annotations
 
 import ctypes
 import logging
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -99,60 +97,3 @@ def _seconds(clock: Path) -> int | None:
         return int(clock.read_text())
     except (OSError, ValueError):
         return None
-
-
-# --------------------------------------------------------------------------------------------------
-# A moment after which optional work is left out.
-
-Now = Callable[[], float]
-"""Seconds on a clock that is never set."""
-
-
-class Deadline:
-    """Work may go on until ``seconds`` have passed; None: for ever."""
-
-    def __init__(
-        self,
-        seconds: float | None = None,
-        now_s: Now = time.monotonic,
-        cut_s: Now = lambda: math.inf,
-    ) -> None:
-        """``cut_s``: the moment at which it ends at the latest, which may come nearer later."""
-        self._now_s, self._cut_s, self._seconds = now_s, cut_s, seconds
-        self._asked_s = math.inf if seconds is None else now_s() + seconds
-
-    @property
-    def _end_s(self) -> float:
-        return min(self._asked_s, self._cut_s())
-
-    @property
-    def left_s(self) -> float:
-        """Seconds that are left; 0 once it is over."""
-        return max(self._end_s - self._now_s(), 0.0)
-
-    @property
-    def over(self) -> bool:
-        """True once no time is left."""
-        return self._now_s() >= self._end_s
-
-    @property
-    def passed(self) -> float:
-        """The share of the time that has passed, 1 once it is over; 0 where it has no end."""
-        if not self._seconds:
-            return 0.0 if self._seconds is None else 1.0
-        return min(max(1.0 - (self._end_s - self._now_s()) / self._seconds, 0.0), 1.0)
-
-    @property
-    def limited(self) -> bool:
-        """False if there is time for ever."""
-        return math.isfinite(self._end_s)
-
-    def within(self, most_s: float | None) -> Deadline:
-        """The earlier of this one and ``most_s`` from now; None: this one."""
-        limits = [] if most_s is None else [most_s]
-        limits += [self.left_s] if self.limited else []
-        return Deadline(min(limits, default=None), self._now_s, self._cut_s)
-
-    def share(self, part: float) -> Deadline:
-        """One after ``part`` of the time that is left."""
-        return self.within(part * self.left_s if self.limited else None)

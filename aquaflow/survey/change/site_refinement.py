@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.held_out import spread

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive.deliverables import Deliverable
 from aquaflow.dive.dive import Dive

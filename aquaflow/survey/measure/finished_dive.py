@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.medium import NAME as MEDIUM

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 
 
 class Clock:

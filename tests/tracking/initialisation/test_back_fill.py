@@ -7,7 +7,7 @@ from threading import Event
 
 import pytest
 
-from aquaflow.base.clocks.wall import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.worker import Worker
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.config.presets import load_configured
