@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -16,9 +17,11 @@ from tests.small_recording import HASTY
 
 
 def run_with_room(room_bytes: int, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """``aquaflow`` where no file can become longer than ``room_bytes``."""
+    """``aquaflow`` where no file can become longer than ``room_bytes``; a compiled module neither,
+    which Python would cut short without a word and later refuse to load."""
     return subprocess.run(
         [str(Path(sys.executable).with_name("aquaflow")), *map(str, arguments)],
+        env=dict(os.environ) | {"PYTHONDONTWRITEBYTECODE": "1"},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, room_bytes)),
         capture_output=True,
         text=True,

@@ -34,11 +34,13 @@ LOOK_S = 0.02
 
 def fill_the_disk() -> None:
     """The operating system says no, not a mock."""
+    sys.dont_write_bytecode = True  # Python cuts a compiled module short without a word
     resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM_BYTES, resource.RLIM_INFINITY))
 
 
 def leave_little_room() -> None:
     """A path finds room, a map does not."""
+    sys.dont_write_bytecode = True
     resource.setrlimit(resource.RLIMIT_FSIZE, (LITTLE_BYTES, resource.RLIM_INFINITY))
 
 

@@ -51,6 +51,8 @@ def run_batch(
         if room_bytes is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, room_bytes))
 
+    if room_bytes is not None:  # Python cuts a compiled module short without a word
+        environment = environment | {"PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(
         [AQUAFLOW, "lab", "batch", *map(str, arguments)],
         env=environment, capture_output=True, text=True, check=False, preexec_fn=limited,
