@@ -47,9 +47,10 @@ NEGLIGIBLE_DEPTH = 0.06
 VISIBLE_DEPTH = 0.12
 """Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
 scenes without water look like 0.02 to 0.05."""
-LAMP_SHOWS = 150.0
-"""Log odds for a lamp from which it is taken as seen: up to 5 by daylight, 84 on AUV surveys, which
-see what their strobes light from one range; 240 to 2100 on ten rendered dives with lamps."""
+LAMP_SHOWS = 20.0
+"""Log odds for a lamp from which it is taken as seen: -28 to 5 by daylight, 59 to 133 on a rendered
+survey by lamps from one height, 97 on an AUV's by its strobe, 240 to 2100 on ten rendered dives
+with lamps (notes/2026-11-water.md#one-height)."""
 EVERY_MODEL = tuple(
     Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible
 )
@@ -134,12 +135,12 @@ def estimating(
     odds = None if dry is None or wet is None else log_odds_of_water(dry, wet)
     if wet is None or (odds is not None and _is_clear(wet, odds)):
         assert dry is not None
-        return (yield from _estimate(observations, dry, odds))
-    lamplit = with_lamp(some)
+        return (yield from _estimate(observations, dry, odds, np.zeros(3)))
+    lamplit, doubt = with_lamp(some), np.zeros(3)
     if (yield from _may_have_lamp(wet, problems(observations, lamplit))):
         if observations.normal is None and pictures:
             observations = yield from with_normals(observations, pictures)
-        wet = yield from _lamplit(wet, problems(observations, lamplit))
+        wet, doubt = yield from _lamplit(wet, problems(observations, lamplit))
     yield
     found = wet.prediction
     extended = yield from with_open_water(observations, pictures, found.trial, found.J.mean(axis=1))
@@ -147,22 +148,24 @@ def estimating(
         wet_models = [model for model in models if model.water]
         wet_models = with_lamp(wet_models) if wet.problem.model.lamp else wet_models
         (wet,) = yield from fit_likeliest(problems(extended, wet_models))
-    return (yield from _estimate(observations, wet, odds, pictures))
+    return (yield from _estimate(observations, wet, odds, doubt, pictures))
 
 
 def _estimate(
     observations: Observations,
     best: WaterFit,
     odds: float | None,
+    doubt: Array,  # [3]
     pictures: Sequence[PosedPicture] = (),
 ) -> Generator[None, None, WaterEstimate]:
-    """What the fit, perhaps to open water too, says of the observations of the surface."""
+    """What the fit, perhaps to open water too, says of the observations of the surface; ``doubt``:
+    how far log beta_a is from what a model says that is not ruled out."""
     shown = yield from _as_pictures_show(best)
     seen, trial, water = observations, shown.prediction.trial, best.problem
     range_variance = [variance_over_range(seen, seen.colour)] * 2
     sigma = nearest = balance = lightness = None
     if water.model.water:
-        sigma = _beta_a_sigma(best)
+        sigma = np.hypot(_beta_a_sigma(best), doubt).tolist()
         J = shown.prediction.J[:, : seen.points]
         nearest = yield from nearest_of(seen, pictures, trial, J.mean(axis=1))
         balance = white_balance(nearest, water, trial, J, sigma)
@@ -220,12 +223,18 @@ def _may_have_lamp(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[N
     return first.log_evidence > wet.log_evidence
 
 
-def _lamplit(wet: WaterFit, problems: Sequence[WaterModel]) -> Generator[None, None, WaterFit]:
-    """The likeliest of the problems, all with a lamp, if that is far likelier than ``wet``."""
+def _lamplit(
+    wet: WaterFit, problems: Sequence[WaterModel]
+) -> Generator[None, None, tuple[WaterFit, Array]]:
+    """The likeliest of the problems, all with a lamp, if that is far likelier than ``wet``; and how
+    far [3] log beta_a is from that of one that is only somewhat likelier."""
     (lit,) = yield from fit_likeliest(problems)
     # Evidence is comparable at one noise only: that of the better fit.
     dark = yield from descend(wet.problem, wet.x, lit.noise)
-    return lit if lit.log_evidence - dark.log_evidence > LAMP_SHOWS else wet
+    odds = lit.log_evidence - dark.log_evidence
+    if odds > LAMP_SHOWS:
+        return lit, np.zeros(3)
+    return wet, np.abs(lit.x[:3] - wet.x[:3]) if odds > 0.0 else np.zeros(3)
 
 
 def _is_clear(wet: WaterFit, odds: float) -> bool:
