@@ -283,6 +283,17 @@ class Sim3Batch:
         t = self.scale[:, None] * _rotate(self.R, other.t) + self.t
         return Sim3Batch(self.R @ other.R, t, self.scale * other.scale)
 
+    def if_finite(self) -> Sim3Batch:
+        """Itself if all are finite; a check before poses are stored.
+
+        Raises:
+            ArithmeticError: an entry is not a number, or a scale is not positive.
+        """
+        entries = (self.R, self.t, self.scale)
+        if not (all(np.isfinite(each).all() for each in entries) and (self.scale > 0.0).all()):
+            raise ArithmeticError("a pose is not finite")
+        return self
+
     def on_group(self) -> Sim3Batch:
         """Rotations put back on SO(3), so that long products do not drift."""
         R = Rotation.from_quat(Rotation.from_matrix(self.R).as_quat()).as_matrix()

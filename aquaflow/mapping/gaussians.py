@@ -455,10 +455,9 @@ def move_views(views: Iterable[View], moves: Mapping[int, Sim3]) -> None:
     # All at once: one by one, the 2000 views of two joined lines would take half a second.
     before = Sim3Batch.of([view.T_wc for view in moving])
     moved = Sim3Batch.of([moves[view.keyframe] for view in moving]) @ before
-    moved = replace(moved, R=on_so3(moved.R))
-    poses = [moved.element(i).if_finite() for i in range(len(moving))]
-    for view, T_wc in zip(moving, poses, strict=True):
-        view.T_wc = T_wc
+    moved = replace(moved, R=on_so3(moved.R)).if_finite()
+    for i, view in enumerate(moving):
+        view.T_wc = moved.element(i)
 
 
 def quaternion_product(

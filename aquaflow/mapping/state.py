@@ -193,13 +193,13 @@ def _joined(
 ) -> Arrays:
     """Tensors of as many axes in three arrays: as an array each, those of an hour's views would
     take a checkpoint's reader ten times as long as all the rest."""
-    known = {i: checkpoint_out(value) for i, value in enumerate(values) if value is not None}
+    known = {i: value for i, value in enumerate(values) if value is not None}
     if not known:
         return {}
     return {
         f"{name}.of": np.array(list(known), np.int64),
         f"{name}.shapes": np.array([value.shape for value in known.values()], np.int64),
-        f"{name}.values": np.concatenate([value.ravel() for value in known.values()]),
+        f"{name}.values": checkpoint_out(torch.cat([value.ravel() for value in known.values()])),
     }
 
 
