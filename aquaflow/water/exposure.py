@@ -7,6 +7,7 @@ The mean over the views is held near one, else bright views and dark points coul
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Sequence
 
 import numpy as np
@@ -68,7 +69,9 @@ def log_gain_at(
     views: Sequence[View],  # in the order of their frames
 ) -> Array:
     """[3] between the views before and after, as a view that was never mapped is shown."""
-    return _between(frame_index, views, log_gains_of(views))
+    after = bisect(views, frame_index, key=lambda view: view.frame_index)
+    around = views[max(after - 1, 0) : after + 1]
+    return _between(frame_index, around, log_gains_of(around))
 
 
 def set_log_gains(
