@@ -143,6 +143,10 @@ def test_a_survey_is_mapped_and_looked_at(tmp_path: Path, monkeypatch: pytest.Mo
     assert sizes[0][0] == pytest.approx(sizes[0][1], rel=0.02)
     assert [each["frames"] for each in row["tenths"]] == [6 * (i + 1) for i in range(10)]
     assert all(sum(each[part] for each in row["tenths"]) > 0.0 for part in PARTS)
+    kept = (tmp_path / "dive" / worker.TENTHS_FILE).read_text().splitlines()
+    assert [json.loads(line) for line in kept] == row["tenths"]
+    assert row["tenths"][0]["ate_sub_maps_pct"] is None, "no frame has a pose yet"
+    assert row["tenths"][-1]["ate_sub_maps_pct"] == pytest.approx(row["ate_sub_maps_pct"], abs=1.0)
     assert row["tracked"] > 0.9 * FRAMES
     assert 0.0 < row["viewer"]["page_s"] < row["viewer"]["map_s"]
     # Other tests ran in this process: what they left free is used before more is asked for.

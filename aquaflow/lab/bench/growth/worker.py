@@ -19,6 +19,7 @@ import numpy as np
 
 from aquaflow.base.stages import Profiler, Stages
 from aquaflow.base.storage.archive import write_facts_file
+from aquaflow.base.storage.atomic import open_to_append
 from aquaflow.config.service import ViewerConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
@@ -75,7 +76,7 @@ def _measure_dive(run: DiveRun, survey: SurveyPictures, job: GrowthJob) -> dict[
     if job.telemetry != "none":
         run.slam.metric.mounting = telemetry.mountings.stated
     samples = telemetry.samples(job.frames / FPS, ABOARD[job.telemetry])
-    meter, waiting = TenthsMeter(run, job.frames), next(samples, None)
+    meter, waiting = TenthsMeter(run, survey, job.frames), next(samples, None)
     for frame in survey.frames(job.frames):
         while waiting is not None and waiting.arrival_ns <= frame.arrival_ns:
             run.sample(waiting)
@@ -113,8 +114,8 @@ def path_errors(run: DiveRun, survey: SurveyPictures) -> dict[str, Any]:
     frame and unit of its own; None where there is none. And ``sub_maps``, their frames."""
     frames = run.slam.metric_frames()
     posed = [each for each in run.results if each.T_wc is not None]
-    truth = np.array([survey.T_wc(each.frame.index).t for each in posed])
-    found = np.array([each.T_wc.t for each in posed if each.T_wc is not None])
+    truth = np.array([survey.T_wc(each.frame.index).t for each in posed]).reshape(-1, 3)
+    found = np.array([each.T_wc.t for each in posed if each.T_wc is not None]).reshape(-1, 3)
     of = np.array([each.sub_map for each in posed])
     length = float(np.linalg.norm(np.diff(truth, axis=0), axis=1).sum())
     squared, counts = 0.0, dict[str, int]()
@@ -248,8 +249,10 @@ LOOKS = 100
 
 Tenth = dict[str, float | None]
 """``tracking_ms``, ``mapping_ms`` and ``graph_ms``, means over the frames of a tenth; at its end
-``frames``, ``keyframes``, ``gaussians``, ``resident_mb`` (None where unknown), ``work_bytes`` and
-``psnr``, dB of views that were just held out."""
+``frames``, ``keyframes``, ``loops``, ``gaussians``, ``resident_mb`` (None where unknown),
+``work_bytes``, ``psnr``, dB of views that were just held out, and the path's errors until then."""
+TENTHS_FILE = "tenths.jsonl"
+"""In the dive's folder: each tenth once it is over, as a dive of hours may not come to its end."""
 
 
 @dataclass(frozen=True)
@@ -268,9 +271,9 @@ class _Spent:
 class TenthsMeter:
     """Looks at a run after every tenth of its frames; its profiler has the thread's clock."""
 
-    def __init__(self, run: DiveRun, frames: int) -> None:
+    def __init__(self, run: DiveRun, survey: SurveyPictures, frames: int) -> None:
         self.tenths: list[Tenth] = []
-        self._run, self._frames = run, frames
+        self._run, self._survey, self._frames = run, survey, frames
         self._done, self._last, self._before = 0, 0, _Spent.now(run)
         self._looks, self._psnr = 0, list[float]()
 
@@ -281,6 +284,8 @@ class TenthsMeter:
             self._look()
         if self._done * TENTHS >= (len(self.tenths) + 1) * self._frames:
             self.tenths.append(self._tenth())
+            with open_to_append(self._run.folder.path / TENTHS_FILE) as stream:
+                stream.write(json.dumps(self.tenths[-1]).encode() + b"\n")
 
     def _look(self) -> None:
         """At the newest held-out view, from the map as it is by now."""
@@ -302,17 +307,20 @@ class TenthsMeter:
 
         elsewhere = (spent.process - before.process) - (spent.thread - before.thread)
         elsewhere = max(elsewhere, 0.0)  # two clocks are read one after the other
-        slam = self._run.slam
+        slam, errors = self._run.slam, path_errors(self._run, self._survey)
         return {
             "frames": self._done,
             "tracking_ms": round(mean_ms(TRACKING), 3),
             "mapping_ms": round(mean_ms(MAPPING), 3),
             "graph_ms": round(mean_ms(GRAPH) + elsewhere / count, 3),
             "keyframes": len(slam.keyframes),
+            "loops": slam.graph.loops,
             "gaussians": sum(mapper.count for mapper in slam.mappers.values()),
             "resident_mb": resident_mb(),
             "work_bytes": folder_bytes(self._run.folder.path),
             "psnr": round(float(np.mean(seen)), 2) if seen else None,
+            "ate_world_pct": errors["ate_world_pct"],
+            "ate_sub_maps_pct": errors["ate_sub_maps_pct"],
         }
 
 
