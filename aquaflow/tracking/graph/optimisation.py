@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from aquaflow.config import GraphConfig
@@ -46,6 +47,8 @@ class Optimisation:
         self.allowed: Array = snapshot.trust["allowed"].copy()
         self.counts: Mask = self.trust > 0.0
         self.dropped: Mask = np.zeros(len(self.edges), dtype=bool)
+        self.held: Mask = np.zeros(len(self.edges), dtype=bool)
+        """[M] loops that would be dropped, if they did not join what nothing else joins."""
         may_move = nodes["number"] != nodes["component"]
         self.active: Mask = may_move if everything else np.zeros(len(nodes), dtype=bool)
         self.descent = Descent(poses_of(nodes), self.edges, self.allowed, may_move, self.config)
@@ -130,10 +133,32 @@ class Optimisation:
         loops = np.flatnonzero(self.edges["loop"] & self.counts & ends)
         if len(loops) == 0:
             return loops
-        self.trust[loops] = trust_of(self._misfit(loops).chi2, self.allowed[loops])
-        out = loops[self.trust[loops] < LEAST_TRUST]
-        self.trust[out], self.counts[out], self.dropped[out] = 0.0, False, True
+        chi2 = self._misfit(loops).chi2
+        self.trust[loops] = trust_of(chi2, self.allowed[loops])
+        low = self.trust[loops] < LEAST_TRUST
+        out = loops[low]
+        ties = self._ties(out)
+        held = out[ties]
+        self.held[held], self.allowed[held], self.trust[held] = True, chi2[low][ties], 1.0
+        away = out[~ties]
+        self.trust[away], self.counts[away], self.dropped[away] = 0.0, False, True
         return out
+
+    def _ties(
+        self,
+        loops: Index,  # [k] numbers of edges
+    ) -> Mask:
+        """[k] which of ``loops`` join keyframes that nothing else joins: without them a part of
+        the dive would be free to go anywhere, so that the world may strain them, and not cut."""
+        if not len(loops):
+            return np.zeros(0, dtype=bool)
+        others = self.counts & self.links
+        others[loops] = False
+        a, b = self.edges["a"][others], self.edges["b"][others]
+        count = len(self.snapshot.nodes)
+        joined = sparse.coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
+        _, part = connected_components(joined, directed=False)
+        return np.asarray(part[self.edges["a"][loops]] != part[self.edges["b"][loops]])
 
     def _result(self) -> GraphResult:
         rows = np.flatnonzero(self.active)
@@ -144,7 +169,9 @@ class Optimisation:
         before = after.move(poses_of(self.snapshot.nodes))
         poses, numbers = poses_of(solved), solved["number"].tolist()
         trust = self.snapshot.trust.copy()
-        trust["trust"], trust["allowed"] = self.trust, self.allowed
+        # Once other loops join the same keyframes, those held now are judged as all are.
+        trust["trust"] = self.trust
+        trust["allowed"] = np.where(self.held, trust["allowed"], self.allowed)
         return GraphResult(
             {number: poses.element(i) for i, number in enumerate(numbers)},
             {int(edge): float(self.trust[edge]) for edge in np.flatnonzero(self.edges["loop"])},

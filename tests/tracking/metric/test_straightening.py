@@ -231,3 +231,38 @@ def test_a_chain_through_the_world_admits_no_loop_that_the_links_contradict() ->
     result, _ = solve_with_worlds(dive.graph.snapshot(), [World(0, Sim3.identity(), edges)])
     loop = int(np.flatnonzero(dive.graph.snapshot().edges["loop"])[0])
     assert result.trust[loop] == 0.0
+
+
+def test_loops_that_alone_hold_a_part_of_the_dive_are_strained_by_a_world_but_not_cut() -> None:
+    """The second half is joined to the first by loops in one place alone, and its compass is off by
+    more than they allow: cut, it would be free to go anywhere."""
+    truth, half = way(), COUNT // 2
+    graph = PoseGraph()
+    for k in range(COUNT):
+        graph.add_keyframe(k, truth.element(k))
+    for k in [*range(1, half), *range(half + 1, COUNT)]:
+        link = truth.element(k - 1).inverse() @ truth.element(k)
+        assert graph.add_edge(Edge(k - 1, k, link, LINK))
+    tie = np.diag(np.array([0.002, 0.002, 0.002, 0.001, 0.001, 0.001, 0.002]) ** -2.0)
+    pairs = [(half - 1 - i, half + i) for i in range(3)]
+    for a, b in pairs:
+        T_ab = truth.element(a).inverse() @ truth.element(b)
+        assert graph.add_edge(Edge(a, b, T_ab, tie, loop=True))
+    edges = []
+    for k in range(COUNT):
+        off = np.array([0.0, 0.0, 0.0 if k < half else 0.3])
+        measured = KeyframeMeasurements(
+            depth_m=(float(truth.t[k, 2]), 0.01), turn=off, turn_sigma=(0.001, 0.001),
+            place_m=(truth.t[k, :2], 1e-3) if k == 0 else None,
+        )  # fmt: skip
+        edge = world_edge(k, graph.pose(k), measured)
+        assert edge is not None
+        edges.append(edge)
+    result, poses = solved(graph, [World(0, Sim3.identity(), edges)])
+    assert all(trust > 0.0 for trust in result.trust.values())
+    for a, b in pairs:
+        apart = poses.element(a).inverse() @ poses.element(b)
+        wanted = truth.element(a).inverse() @ truth.element(b)
+        assert np.linalg.norm(apart.t - wanted.t) < 0.3
+    allowed = graph.snapshot().trust["allowed"]
+    assert (allowed == graph.config.loop_chi2).all(), "they are judged as others from here on"
