@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,7 @@ from aquaflow.cli.console import Json, progress_bars
 if TYPE_CHECKING:
     from aquaflow.survey.change.site_refinement import RefinedMap
     from aquaflow.survey.site.merged_file import MergedSite
-    from aquaflow.survey.site.merging import Progress
+    from aquaflow.survey.site.merging import LookUp, Progress
 
 Site = Annotated[Path, typer.Argument(help="Site folder.")]
 
@@ -68,6 +69,9 @@ def merge(
 LOOK_UP_MB = 300
 """What a process takes that looks a dive up, 1e6 bytes: 170 of it libraries, 77 the keypoints that
 it holds (links.KEPT)."""
+KEYFRAMES_AT_ONCE = 60
+"""That a process looks up at least, so that its start, 0.6 s of CPU, is a tenth of it: a keyframe
+takes 0.03 to 0.1 s (notes/2026-11-sites.md#distributed)."""
 
 
 def _look_up_elsewhere(
@@ -80,17 +84,34 @@ def _look_up_elsewhere(
     from aquaflow.survey.site.merging import look_ups
 
     asked = validate(BatchConfig, {"jobs": jobs, "cluster": cluster}, COMMAND_LINE)
-    where = str(site.resolve())
     calls = [
         CallJob(
-            each.name, "aquaflow.survey.site.merging:look_up",
-            {"site": where, "dive": each.dive, "among": each.among}, len(each.among), LOOK_UP_MB,
+            _name_of(part), "aquaflow.survey.site.merging:look_up",
+            {"site": str(site.resolve()), "wanted": [(each.dive, each.among) for each in part]},
+            sum(each.keyframes for each in part), LOOK_UP_MB,
         )
-        for each in look_ups(site)
+        for part in _parts(look_ups(site))
     ]  # fmt: skip
     failed = run_calls(calls, site, "look-ups", asked, progress) if calls else {}
     for name, why in failed.items():
         typer.echo(f"Looking up {name} failed elsewhere and is done here: {why}.", err=True)
+
+
+def _parts(wanted: list[LookUp]) -> Iterator[list[LookUp]]:
+    """As many look-ups together as are worth a process, in their order."""
+    part: list[LookUp] = []
+    for each in wanted:
+        part.append(each)
+        if sum(one.keyframes for one in part) >= KEYFRAMES_AT_ONCE:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def _name_of(part: list[LookUp]) -> str:
+    first, more = part[0].name, len(part) - 1
+    return f"{first} and {more} more" if more else first
 
 
 @app.command("map")

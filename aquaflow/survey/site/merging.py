@@ -239,6 +239,8 @@ class LookUp:
     """Its fingerprint."""
     among: tuple[str, ...]
     """Those of the others."""
+    keyframes: int
+    """Of the dive; each is compared with no more keyframes, however many the others are."""
 
 
 def look_ups(site: Path) -> list[LookUp]:
@@ -259,7 +261,8 @@ def look_ups(site: Path) -> list[LookUp]:
             links = known or _NO_LINKS
             others = _links_from(site, before, dive, links) if known else []
             if among := _left(before, links, others):
-                found.append(LookUp(taking[dive].dive.name, dive, tuple(among)))
+                mine = taking[dive]
+                found.append(LookUp(mine.dive.name, dive, tuple(among), len(mine.places.places)))
             elif known is None:
                 write_links(site, dive, _NO_LINKS)
             before.append(dive)
@@ -268,17 +271,20 @@ def look_ups(site: Path) -> list[LookUp]:
     return found
 
 
-def look_up(site: str, dive: str, among: Sequence[str]) -> None:
-    """Do one of :func:`look_ups`, of the site in the folder ``site``.
+def look_up(site: str, wanted: Sequence[tuple[str, Sequence[str]]]) -> None:
+    """Do some of :func:`look_ups`, of the site in the folder ``site``: each a dive and those that
+    it is looked for in, by their fingerprints.
 
     Raises:
         InputError: a file is damaged, or cannot be written.
     """
     where = Path(site)
     taking = {each.fingerprint: Taking(each, each.folder(where), {}) for each in read_site(where)}
-    index, known = read_index(where, taking), read_links(where, dive) or _NO_LINKS
-    links = known + _look_up(where, taking, index, dive, among, lambda *_: None)
-    write_links(where, dive, links)
+    index = read_index(where, taking)
+    for dive, among in wanted:
+        known = read_links(where, dive) or _NO_LINKS
+        links = known + _look_up(where, taking, index, dive, among, lambda *_: None)
+        write_links(where, dive, links)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -140,7 +140,7 @@ def test_look_ups_done_apart_in_any_order_give_the_same_bytes(
     wanted = look_ups(site)
     assert [(each.name, len(each.among)) for each in wanted] == [("b", 1), ("elsewhere", 2)]
     for each in reversed(wanted):
-        look_up(str(site), each.dive, list(each.among))
+        look_up(str(site), [(each.dive, each.among)])
     assert look_ups(site) == []
     monkeypatch.setattr(merging, "find_links", None)  # there is nothing left to look up
     merge(site)
@@ -156,7 +156,7 @@ def test_a_look_up_that_came_to_nothing_is_done_by_the_merge(tmp_path: Path) -> 
     ]
     add_to_site(site, dives)
     last = look_ups(site)[-1]
-    look_up(str(site), last.dive, list(last.among))
+    look_up(str(site), [(last.dive, last.among)])
     found = merge(site)
     assert [each["dives"] for each in found.components] == [["0", "1", "2"]]
     pairs = {frozenset((link["a"]["dive"], link["b"]["dive"])) for link in found.links}

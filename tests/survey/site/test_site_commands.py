@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.cli import site as site_commands
 from aquaflow.lab.batch import ray_workers, workers
 from aquaflow.lab.batch.job import BatchOutcome, Job
 from aquaflow.lab.batch.run_job import RunningProcesses
@@ -51,7 +52,11 @@ def test_a_folder_that_is_no_site_is_refused_in_a_sentence(command: Cli, tmp_pat
     assert "is no site" in refused.err
 
 
-def test_look_ups_by_other_processes_give_the_same_merge(command: Cli, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("at_once", "jobs"), [(1, ["b", "c"]), (60, ["b and 1 more"])])
+def test_look_ups_by_other_processes_give_the_same_merge(
+    command: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int, jobs: list[str]
+) -> None:
+    monkeypatch.setattr(site_commands, "KEYFRAMES_AT_ONCE", at_once)
     scene = Scene(1)
     dives = [
         stated_dive(tmp_path / name, scene, start=0.2 * seed, count=3, seed=seed)
@@ -64,7 +69,7 @@ def test_look_ups_by_other_processes_give_the_same_merge(command: Cli, tmp_path:
     said = command("site", "merge", together, "--jobs", "2", "--json")
     assert [each["dives"] for each in json.loads(said.out)["components"]] == [["a", "b", "c"]]
     events = [(each["event"], each.get("dive")) for each in read_journal(together / JOURNAL)]
-    assert sorted(name for event, name in events if event == "done" and name) == ["b", "c"]
+    assert sorted(name for event, name in events if event == "done" and name) == jobs
     assert (together / "merged.json").read_bytes() == (alone / "merged.json").read_bytes()
     assert (together / "joint.npz").read_bytes() == (alone / "joint.npz").read_bytes()
     assert command("site", "merge", together, "--jobs", "2").code == 0, "nothing is left to do"
