@@ -128,8 +128,10 @@ def confidence(
     The mean around a pixel is the flow itself where that is affine, however much it turns or grows.
     """
     window = (EDGE_WINDOW_PX, EDGE_WINDOW_PX)
-    # In OpenCV's vectors, and no [H, W, 2] in NumPy: half the time.
-    size = cv2.magnitude(*cv2.split(flow.forward - cv2.blur(flow.forward, window)))
+    # No [H, W, 2] in NumPy: half the time. Not cv2.magnitude, whose last digit depends on where its
+    # arrays lie in memory, so that a replay would not repeat.
+    x, y = cv2.split(flow.forward - cv2.blur(flow.forward, window))
+    size = np.sqrt(x * x + y * y)
     edge = cv2.dilate(size, np.ones(window, np.uint8)) * np.float32(EDGE_WEIGHT / flow.sigma_px)
     certain = np.asarray(cv2.exp(flow.error * flow.error * np.float32(-0.5 / flow.sigma_px**2)))
     return np.asarray(certain * flow.valid / (1.0 + edge * edge), dtype=np.float32)

@@ -202,6 +202,22 @@ def test_a_turning_growing_flow_without_edges_is_certain() -> None:
     assert certain[8:-8, 8:-8].min() > 0.99
 
 
+def test_confidence_does_not_depend_on_where_its_arrays_lie() -> None:
+    """Or a replay would not repeat: memory lies elsewhere in every process."""
+    rng = np.random.default_rng(3)
+    forward = rng.normal(0.0, 2.0, (60, 90, 2)).astype(np.float32)
+    found = set()
+    for offset in range(0, 64, 4):
+        room = np.empty(forward.nbytes + 128, np.uint8)
+        first = -room.ctypes.data % 64 + offset
+        moved = room[first : first + forward.nbytes].view(np.float32).reshape(forward.shape)
+        moved[:] = forward
+        kept = np.empty(1 + 997 * offset, np.uint8)  # what is made next lies elsewhere
+        found.add(confidence(perfect(moved)).tobytes())
+        del kept
+    assert len(found) == 1
+
+
 def test_what_is_not_matched_has_no_confidence() -> None:
     forward = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     flow = perfect(forward)
