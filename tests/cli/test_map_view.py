@@ -36,6 +36,9 @@ OTHER_FILES = {"log.jsonl", "metrics.json", "report.html", "view.zip"}
 
 ASK_S = 0.2
 """Between two questions; the page asks twice a second."""
+PAUSE_S = 0.6
+"""Which a command stands still after each question: a map is shown anew after three seconds, and a
+fast machine has mapped the whole dive by then."""
 
 Scene = dict[str, Any]
 
@@ -60,6 +63,15 @@ def disconnect(address: str) -> None:
     port = int(address.rstrip("/").rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port), GIVE_UP_S) as client:
         client.sendall(b"GET /scene.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET /pic")
+
+
+def stand_still(process_id: int) -> None:
+    """For PAUSE_S."""
+    os.kill(process_id, signal.SIGSTOP)
+    try:
+        time.sleep(PAUSE_S)
+    finally:
+        os.kill(process_id, signal.SIGCONT)
 
 
 def said(process_id: int, pattern: str, stream: int = 2) -> str:
@@ -100,6 +112,7 @@ def test_a_dive_is_seen_to_grow_and_then_finished_and_its_files_are_the_same(
             while not scenes or scenes[-1]["live"]:
                 with contextlib.suppress(OSError):  # the finished dive is being read
                     scenes.append(asked(address))
+                stand_still(process_id)
                 time.sleep(ASK_S)
             assert said(process_id, r"Open (\S+) in a browser; Ctrl-C", stream=1) == address
         finally:
