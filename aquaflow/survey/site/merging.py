@@ -77,8 +77,7 @@ def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:
     try:
         before = _before(site)
         taking, left_out = _taking(site, dives)
-        joint = read_joint(site, {dive: each.frames for dive, each in taking.items()})
-        joint = joint or JointGraph()
+        joint = _joint_of(site, taking)
         if taking.keys() - joint.dives:
             _join(site, taking, joint, left_out, progress)
             write_joint(site, joint)
@@ -125,6 +124,12 @@ def _taking(site: Path, dives: Sequence[SiteDive]) -> tuple[dict[str, Taking], d
     return taking, left_out
 
 
+def _joint_of(site: Path, taking: Mapping[str, Taking]) -> JointGraph:
+    """As the last merge left it; an empty one where there is none of these dives."""
+    joint = read_joint(site, {dive: each.frames for dive, each in taking.items()})
+    return joint or JointGraph()
+
+
 def _require(site: Path, taking: Mapping[str, Taking], left_out: Mapping[str, str]) -> None:
     if not taking:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
@@ -148,11 +153,8 @@ def _join(
     """Add the dives that are not in the joint graph yet: those that were looked up before first."""
     index = _index(site, taking, left_out)
     for dive, known in _in_order(site, taking, joint):
-        if dive not in taking:
-            continue
         links = known or _NO_LINKS
-        others = _links_from(site, joint.dives, dive, links) if known else []
-        among = _left(joint.dives, links, others)
+        others, among = _left(site, joint.dives, dive, known)
         if among or known is None:
             links += _look_up(site, taking, index, dive, among, progress)
             write_links(site, dive, links)
@@ -170,11 +172,15 @@ def _in_order(
 
 
 def _left(
-    dives: Sequence[str], links: DiveLinks, others: Sequence[tuple[str, DiveLinks]]
-) -> list[str]:
-    """Those of ``dives`` that neither a dive was looked for in nor were looked for in it."""
-    covered = {*links.among, *(each for each, _ in others)}
-    return [each for each in dives if each not in covered]
+    site: Path, dives: Sequence[str], dive: str, known: DiveLinks | None
+) -> tuple[list[tuple[str, DiveLinks]], list[str]]:
+    """Of ``dives``: what those found that were looked for in ``dive``, and those that neither it
+    was looked for in nor were looked for in it."""
+    if known is None:
+        return [], list(dives)
+    others = _links_from(site, dives, dive, known)
+    covered = {*known.among, *(each for each, _ in others)}
+    return others, [each for each in dives if each not in covered]
 
 
 def _index(site: Path, taking: dict[str, Taking], left_out: dict[str, str]) -> PlaceIndex:
@@ -253,14 +259,12 @@ def look_ups(site: Path) -> list[LookUp]:
     lock = FolderLock(site)
     try:
         taking, left_out = _taking(site, dives)
-        joint = read_joint(site, {dive: each.frames for dive, each in taking.items()})
-        joint = joint or JointGraph()
+        joint = _joint_of(site, taking)
         _index(site, taking, left_out)
         before, found = list(joint.dives), list[LookUp]()
         for dive, known in _in_order(site, taking, joint):
-            links = known or _NO_LINKS
-            others = _links_from(site, before, dive, links) if known else []
-            if among := _left(before, links, others):
+            _, among = _left(site, before, dive, known)
+            if among:
                 mine = taking[dive]
                 found.append(LookUp(mine.dive.name, dive, tuple(among), len(mine.places.places)))
             elif known is None:
